@@ -1,0 +1,93 @@
+"""The one value every estimator returns, and the fallback that needs no estimator at all."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fusion.problem import Problem
+from fusion.result import ScaleConclusion
+from vio import se3
+from vio.motions import RelativeMotions, chain_motions
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """States at all M nodes of a problem."""
+
+    T_world_body: Array
+    """(M, 4, 4)"""
+    cov: Array
+    """(M, 6, 6) right perturbation, rotation first."""
+    velocity_m_s: Array
+    """(M, 3)"""
+    gyro_bias_rad_s: Array
+    """(M, 3)"""
+    accel_bias_m_s2: Array
+    """(M, 3)"""
+    log_scale: Array
+    """(M,)"""
+    log_scale_sd: Array
+    """(M,)"""
+    scale: ScaleConclusion
+    rejected: NDArray[np.int64]
+    """Motions that were gated or inflated as outliers."""
+    imu_chi2_per_dof: float | None = None
+    imu_inflation: float = 1.0
+
+
+def add_scale_uncertainty(T_world_body: Array, cov: Array, log_scale_sd: float) -> Array:
+    """Covariances (M, 6, 6) widened for a scale that was assumed, not estimated.
+
+    A scale error stretches the track about its first pose: d(position)/ds = position - first position.
+    """
+    away = T_world_body[:, :3, 3] - T_world_body[0, :3, 3]
+    g = np.zeros((len(away), 6))
+    g[:, 3:] = (np.swapaxes(T_world_body[:, :3, :3], 1, 2) @ away[:, :, None])[:, :, 0]
+    widened: Array = cov + log_scale_sd**2 * g[:, :, None] * g[:, None, :]
+    return widened
+
+
+def motions_estimate(problem: Problem, motions: RelativeMotions, T_world_first: Array, tilt_sd_rad: float) -> Estimate:
+    """Chain the motions alone at the prior scale, with propagated covariances: the last resort.
+
+    Roll and pitch of the first pose come from gravity; nothing corrects them afterwards.
+    """
+    T_body_camera = problem.motions.T_body_camera
+    trajectory, _ = chain_motions(motions, problem.t_s, T_body_camera, T_world_first)
+    T = trajectory.T_world_body
+    cov = _propagate(problem, T, tilt_sd_rad)
+    m = len(problem)
+    sd = problem.scale_log_sd
+    velocity = np.gradient(T[:, :3, 3], problem.t_s, axis=0)
+    return Estimate(
+        T, add_scale_uncertainty(T, cov, sd), velocity, np.tile(problem.gyro_bias_rad_s, (m, 1)), np.zeros((m, 3)),
+        np.full(m, problem.scale_log_mean), np.full(m, sd),
+        ScaleConclusion("fixed", problem.scale_log_mean, sd, "no estimator ran; the prior scale is used as it is"),
+        np.zeros(0, np.int64),
+    )
+
+
+def _propagate(problem: Problem, T: Array, tilt_sd_rad: float) -> Array:
+    """Covariance of chained motions: Σ_{k+1} = Ad Σ_k Adᵀ + Q, in the body axes of each pose."""
+    m = len(T)
+    Q = np.zeros((m - 1, 6, 6))
+    Q[:] = np.diag([0.5**2] * 3 + [0.05**2] * 3)  # a pair no motion measured
+    motions, scale = problem.motions, np.exp(problem.scale_log_mean)
+    consecutive = motions.j - motions.i == 1
+    lower = np.linalg.inv(motions.whiten[consecutive])
+    units = np.diag([1.0] * 3 + [scale] * 3)
+    Ad_bc = se3.adjoint(motions.T_body_camera)
+    Q[motions.i[consecutive]] = Ad_bc @ units @ lower @ np.swapaxes(lower, 1, 2) @ units @ Ad_bc.T
+    back = se3.adjoint(se3.inverse(se3.inverse(T[:-1]) @ T[1:]))
+    cov = np.zeros((m, 6, 6))
+    R0 = T[0, :3, :3]
+    cov[0, :3, :3] = R0.T @ np.diag([tilt_sd_rad**2, tilt_sd_rad**2, 1e-12]) @ R0
+    cov[0, 3:, 3:] = 1e-12 * np.eye(3)
+    for k in range(m - 1):
+        cov[k + 1] = back[k] @ cov[k] @ back[k].T + Q[k]
+    return cov

@@ -1,0 +1,182 @@
+"""The factor-graph recipe: chunks → fixed scale → scale policy → Huber → gate → Gaussian → covariances."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import gtsam
+import numpy as np
+from gtsam.symbol_shorthand import S
+from numpy.typing import NDArray
+
+from fusion import scale as scale_policy
+from fusion.config import RefineConfig
+from fusion.covariance import marginal_covariances
+from fusion.estimate import Estimate, add_scale_uncertainty
+from fusion.graph import add_anchor, add_imu, add_scale_walk, read_log_scales, read_states
+from fusion.initialization import Start, chunked_start, search_log_scale
+from fusion.problem import Problem
+from fusion.result import ScaleConclusion
+from fusion.scale import FreePass, Segments
+from fusion.solve import MotionTerm, Solution, gauss_newton, linear_graph
+from fusion.stages import Stages
+from vio.errors import EstimationError
+
+Array = NDArray[np.float64]
+
+COARSE_TOLERANCE = 1e-3
+"""Of the Huber passes: they only have to tell outliers from the rest, and Huber alone would bias the scale."""
+GATED_WEIGHT = 1e-6
+GATE_ROUNDS = 3
+
+
+@dataclass(frozen=True)
+class _Pass:
+    """A finished optimisation with its factors, ready for covariances."""
+
+    native: gtsam.NonlinearFactorGraph
+    term: MotionTerm
+    solution: Solution
+    imu_chi2: float
+
+    @property
+    def rejected(self) -> NDArray[np.int64]:
+        return np.flatnonzero(self.term.weight < 1.0)
+
+
+class GraphEstimator:
+    """Solves one problem; holds what the passes share."""
+
+    def __init__(self, problem: Problem, config: RefineConfig, stages: Stages) -> None:
+        self.problem, self.config, self.stages = problem, config, stages
+        self.segments: Segments = scale_policy.make_segments(problem.t_s, config.scale.segment_s)
+
+    def estimate(self) -> Estimate:
+        """Run the whole recipe.
+
+        Raises:
+            EstimationError: a stage found no solution.
+        """
+        self._check_solvable()
+        start_scale = self._start_scale()
+        with self.stages("initialization"):
+            start = self._start(start_scale, 1.0)
+        with self.stages("fixed_scale"):
+            fixed = self._fixed_pass(start, start_scale)
+        final, conclusion, inflation = self._decide(start, fixed, start_scale)
+        with self.stages("covariances"):
+            return self._read(final, conclusion, fixed.imu_chi2, inflation)
+
+    def _check_solvable(self) -> None:
+        if not self.problem.imu_usable.any():
+            raise EstimationError("graph: no frame interval has usable IMU data")
+
+    def _start_scale(self) -> float:
+        if self.problem.scale_log_sd <= scale_policy.VAGUE_PRIOR_SD or self.config.scale.policy == "fixed":
+            return self.problem.scale_log_mean
+        with self.stages("scale_search"):
+            return search_log_scale(self.problem, self.config)
+
+    def _start(self, log_scale: float, inflation: float) -> Start:
+        return chunked_start(self.problem, self.config, log_scale, inflation)
+
+    def _native(self, start: Start) -> gtsam.NonlinearFactorGraph:
+        native = gtsam.NonlinearFactorGraph()
+        add_anchor(native, 0, start.anchor)
+        add_imu(native, start.measurements, self.problem)
+        return native
+
+    def _fixed_pass(self, start: Start, log_scale: float) -> _Pass:
+        native = self._native(start)
+        motions = self.problem.motions
+        term = MotionTerm(motions, None, log_scale, self.config.robust.huber, np.ones(len(motions)))
+        solution = gauss_newton(native, start.values, term, self.config.solver.max_iterations, COARSE_TOLERANCE)
+        return self._finished(native, term, solution)
+
+    def _finished(self, native: gtsam.NonlinearFactorGraph, term: MotionTerm, solution: Solution) -> _Pass:
+        chi2 = scale_policy.imu_chi2(solution.native_cost, int(self.problem.imu_usable.sum()))
+        return _Pass(native, term, solution, chi2)
+
+    def _decide(self, start: Start, fixed: _Pass, start_scale: float) -> tuple[_Pass, ScaleConclusion, float]:
+        """Try scale free; when that must not be believed, down-weight the accelerometer; else hold the scale."""
+        policy, limit = self.config.scale.policy, self.config.scale.imu_chi2_limit
+        if policy == "fixed" or self.problem.scale_log_sd == 0:
+            reason = "asked for" if policy == "fixed" else "the source declares its scale exactly known"
+            return self._held(fixed, start_scale, reason), self._held_conclusion(start_scale, reason), 1.0
+        objection = None
+        if policy in ("auto", "free"):
+            final, free = self._free_pass(start, fixed, start_scale)
+            objection = scale_policy.reasons_against(free, self.problem, self.config.scale)
+            if objection is None or policy == "free":
+                conclusion = scale_policy.conclude_free(free, self.problem)
+                if policy == "free":
+                    conclusion = replace(conclusion, policy="free", reason=f"asked for; {objection or conclusion.reason}")
+                return final, conclusion, 1.0
+        for inflation in scale_policy.INFLATION_LADDER:
+            with self.stages("accelerometer_down_weighted"):
+                weak_start = self._start(start_scale, inflation)
+                weak = self._fixed_pass(weak_start, start_scale)
+            if weak.imu_chi2 <= limit:
+                final, free = self._free_pass(weak_start, weak, start_scale)
+                if scale_policy.reasons_against(free, self.problem, self.config.scale) is None:
+                    reason = f"scale from the prior, accelerometer noise × {inflation:g}: {objection or 'asked for'}"
+                    conclusion = replace(scale_policy.conclude_free(free, self.problem), policy="prior", reason=reason)
+                    return final, conclusion, inflation
+        reason = f"scale held at its prior, accelerometer noise × {inflation:g}: {objection or 'asked for a prior only'}"
+        return self._held(weak, start_scale, reason), self._held_conclusion(start_scale, reason), inflation
+
+    def _held_conclusion(self, log_scale: float, reason: str) -> ScaleConclusion:
+        return ScaleConclusion("fixed", log_scale, self.problem.scale_log_sd, reason)
+
+    def _held(self, fixed: _Pass, log_scale: float, reason: str) -> _Pass:
+        with self.stages("gate"):
+            return self._gated(fixed)
+
+    def _free_pass(self, start: Start, fixed: _Pass, start_scale: float) -> tuple[_Pass, FreePass]:
+        scale, problem = self.config.scale, self.problem
+        native = gtsam.NonlinearFactorGraph(fixed.native)
+        add_scale_walk(native, self.segments.t_s, problem.scale_log_mean, problem.scale_log_sd, scale.walk_per_sqrt_s)
+        values = gtsam.Values(fixed.solution.values)
+        for k in range(len(self.segments.t_s)):
+            values.insert(S(k), start_scale)
+        term = replace(fixed.term, segment=self.segments.of_node[problem.motions.i])
+        with self.stages("free_scale"):
+            solution = gauss_newton(native, values, term, self.config.solver.max_iterations, COARSE_TOLERANCE)
+        with self.stages("gate"):
+            final = self._gated(self._finished(native, term, solution))
+        with self.stages("scale_uncertainty"):
+            gaussian = linear_graph(final.native, final.solution.values, final.term)
+            variance = marginal_covariances(gaussian, 0, len(self.segments.t_s))[1]
+        log_scale = read_log_scales(final.solution.values, len(self.segments.t_s))
+        share = len(final.rejected) / len(problem.motions)
+        return final, FreePass(final.imu_chi2, log_scale, np.sqrt(variance), share)
+
+    def _gated(self, huber: _Pass) -> _Pass:
+        """Reject what lies beyond the gate, solve as Gaussian, and look again until the gate is settled."""
+        current, gate, solver = huber, self.config.robust.gate, self.config.solver
+        for _ in range(GATE_ROUNDS):
+            weight = np.where(current.solution.squared_norm < gate, 1.0, GATED_WEIGHT)
+            if current.term.huber is None and (weight == current.term.weight).all():
+                break
+            term = replace(current.term, huber=None, weight=weight)
+            solution = gauss_newton(current.native, current.solution.values, term, solver.max_iterations,
+                                    solver.relative_tolerance)
+            current = self._finished(current.native, term, solution)
+        return current
+
+    def _read(self, final: _Pass, conclusion: ScaleConclusion, fixed_chi2: float, inflation: float) -> Estimate:
+        m, segments = len(self.problem), len(self.segments.t_s)
+        estimated = final.term.segment is not None
+        gaussian = linear_graph(final.native, final.solution.values, final.term)
+        cov, variance = marginal_covariances(gaussian, m, segments if estimated else 0)
+        states = read_states(final.solution.values, 0, m)
+        T = states.T_world_body
+        if estimated:
+            of_node = self.segments.of_node
+            log_scale = read_log_scales(final.solution.values, segments)[of_node]
+            log_scale_sd = np.sqrt(variance)[of_node]
+        else:
+            log_scale, log_scale_sd = np.full(m, conclusion.log_mean), np.full(m, conclusion.log_sd)
+            cov = add_scale_uncertainty(T, cov, conclusion.log_sd)
+        return Estimate(T, cov, states.v, states.gyro_bias, states.accel_bias, log_scale, log_scale_sd, conclusion,
+                        final.rejected, fixed_chi2, inflation)

@@ -1,0 +1,106 @@
+"""Everything an estimator needs, checked and aligned: nodes, IMU pieces, whitened motions."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fusion.scaled_motion import ScaledMotions, make_motions
+from fusion.vibration import vibration_inflation
+from vio import se3
+from vio.imu import Gap, ImuNoise, ImuPieces, find_gaps, preintegrate_rotation, split_at_frames
+from vio.imu_checks import check_imu
+from vio.motions import RelativeMotions, match_frames
+from vio.recording import Recording, check_refinable
+
+Array = NDArray[np.float64]
+
+HOLE_RATIO = 1.5
+"""Sample spacing over the nominal one above which an interval's noise is inflated."""
+BIAS_FRAMES = 3000
+"""Frames used for the robust initial gyro bias."""
+
+
+@dataclass(frozen=True)
+class Problem:
+    """One estimation problem of M nodes (frames) and N motions."""
+
+    name: str
+    t_s: Array
+    """(M,) node times."""
+    pieces: ImuPieces
+    """IMU of the M-1 intervals."""
+    imu_usable: NDArray[np.bool_]
+    """(M-1,) False where a gap makes the interval's inertial factor worthless."""
+    gaps: tuple[Gap, ...]
+    accel_inflation: Array
+    """(M-1,) factor on the accelerometer density: missing samples, vibration inside a sample."""
+    gyro_inflation: Array
+    """(M-1,) factor on the gyro density."""
+    motions: ScaledMotions
+    scale_log_mean: float
+    scale_log_sd: float
+    noise: ImuNoise
+    gyro_bias_rad_s: Array
+    """(3,) robust initial value: median disagreement of measured and gyro rotation."""
+
+    @property
+    def dt_s(self) -> Array:
+        """(M-1,) interval lengths."""
+        return np.diff(self.t_s)
+
+    def __len__(self) -> int:
+        return len(self.t_s)
+
+
+def build_problem(recording: Recording, motions: RelativeMotions) -> Problem:
+    """Check a recording and its motions, and align both on the frames the motions span.
+
+    Raises:
+        VioError: any input that cannot be used, in one line.
+    """
+    check_refinable(recording)
+    check_imu(recording.imu, recording.calibration.imu_noise)
+    i, j = match_frames(motions, recording.frame_t_s)
+    lo, hi = int(i.min()), int(j.max())
+    t = recording.frame_t_s[lo:hi + 1]
+    imu_t = recording.imu_t_s
+    pieces = split_at_frames(recording.imu, imu_t, t)
+    gaps = tuple(find_gaps(imu_t))
+    batch = make_motions(i - lo, j - lo, motions.T_i_j, motions.cov, recording.calibration.T_body_camera)
+    usable = _usable(t, gaps)
+    noise = recording.calibration.imu_noise
+    holes = _hole_inflation(pieces, imu_t)
+    accel_inflation, gyro_inflation = vibration_inflation(recording.imu, imu_t, t, noise)
+    return Problem(
+        name=recording.name, t_s=t, pieces=pieces, imu_usable=usable, gaps=gaps,
+        accel_inflation=holes * accel_inflation, gyro_inflation=holes * gyro_inflation, motions=batch,
+        scale_log_mean=motions.scale_log_mean, scale_log_sd=motions.scale_log_sd, noise=noise,
+        gyro_bias_rad_s=_initial_gyro_bias(pieces, batch, np.diff(t), usable),
+    )
+
+
+def _usable(t: Array, gaps: tuple[Gap, ...]) -> NDArray[np.bool_]:
+    usable = np.ones(len(t) - 1, bool)
+    for gap in gaps:
+        usable &= (t[1:] <= gap.start_s) | (t[:-1] >= gap.end_s)
+    return usable
+
+
+def _hole_inflation(pieces: ImuPieces, imu_t_s: Array) -> Array:
+    ratio = pieces.longest_s / np.median(np.diff(imu_t_s))
+    return np.where(ratio > HOLE_RATIO, ratio, 1.0)
+
+
+def _initial_gyro_bias(pieces: ImuPieces, motions: ScaledMotions, dt: Array, usable: NDArray[np.bool_]) -> Array:
+    """Median of `Log(R_measᵀ R_gyro) / dt` over consecutive motions: robust, needs no graph."""
+    use = np.flatnonzero((motions.j - motions.i == 1) & usable[motions.i])[:BIAS_FRAMES]
+    if len(use) == 0:
+        return np.zeros(3)
+    k = motions.i[use]
+    gyro = preintegrate_rotation(pieces, np.zeros(3))[k]
+    off = se3.so3_log(np.swapaxes(motions.select(use).body_rotation(), 1, 2) @ gyro)
+    bias: Array = np.median(off / dt[k, None], axis=0)
+    return bias

@@ -1,0 +1,122 @@
+"""The policy: graph → EKF → motions alone; every step down with its recorded reason."""
+
+from __future__ import annotations
+
+import resource
+import sys
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fusion.config import RefineConfig
+from fusion.ekf import ekf_estimate
+from fusion.estimate import Estimate, motions_estimate
+from fusion.graph_estimator import GraphEstimator
+from fusion.initialization import level_rotation
+from fusion.problem import Problem, build_problem
+from fusion.result import Estimator, ImuConclusion, Refinement
+from fusion.stages import Stages
+from vio import se3
+from vio.errors import EstimationError
+from vio.imu import preintegrate_rotation
+from vio.motions import RelativeMotions, chain_motions
+from vio.recording import Recording
+from vio.trajectory import Trajectory
+
+Array = NDArray[np.float64]
+
+
+def refine(recording: Recording, motions: RelativeMotions, config: RefineConfig | None = None,
+           announce: Callable[[str], None] | None = None) -> Refinement:
+    """Turn relative motions and inertial samples into one globally consistent trajectory.
+
+    Args:
+        recording: frames' times, IMU and calibration; images are not read.
+        motions: measured motions of the camera, from any source.
+        config: every knob; defaults when None.
+        announce: called with the name of every stage as it begins.
+
+    Returns:
+        The refined trajectory with covariances, beside the trajectory of the motions alone at the
+        same frames, and the reasons for every choice.
+
+    Raises:
+        VioError: an input that cannot be used, in one line.
+        EstimationError: a forced estimator failed, or none produced a trajectory.
+    """
+    config = config or RefineConfig()
+    stages = Stages(announce)
+    with stages("checks"):
+        problem = build_problem(recording, motions)
+    estimate, estimator, reason = _first_that_works(problem, motions, config, stages)
+    return _conclude(recording, motions, problem, estimate, estimator, reason, stages)
+
+
+def _first_that_works(problem: Problem, motions: RelativeMotions, config: RefineConfig,
+                      stages: Stages) -> tuple[Estimate, Estimator, str | None]:
+    reasons: list[str] = []
+    if config.estimator in ("auto", "graph"):
+        try:
+            return _sane(GraphEstimator(problem, config, stages).estimate(), "graph"), "graph", None
+        except EstimationError as error:
+            if config.estimator == "graph":
+                raise
+            reasons.append(str(error))
+    first_R = _level_first(problem)
+    try:
+        with stages("ekf"):
+            estimate = _sane(ekf_estimate(problem, first_R, config.initial), "ekf")
+        return estimate, "ekf", "; ".join(reasons) or None
+    except EstimationError as error:
+        if config.estimator == "ekf":
+            raise
+        reasons.append(str(error))
+    with stages("motions"):
+        first = se3.transform(first_R, np.zeros(3))
+        estimate = _sane(motions_estimate(problem, motions, first, config.initial.tilt_sd_rad), "motions")
+    return estimate, "motions", "; ".join(reasons)
+
+
+def _level_first(problem: Problem) -> Array:
+    """Attitude (3, 3) of the first node from gravity and the gyro's first seconds."""
+    gyro = preintegrate_rotation(problem.pieces, problem.gyro_bias_rad_s)
+    return level_rotation(problem, se3.chain(se3.transform(gyro, np.zeros(3)))[:, :3, :3], 0)
+
+
+def _sane(estimate: Estimate, name: str) -> Estimate:
+    """Reject results that are numbers but not an answer."""
+    if not (np.isfinite(estimate.T_world_body).all() and np.isfinite(estimate.cov).all()):
+        raise EstimationError(f"{name}: a pose or covariance is not finite")
+    smallest = np.diagonal(estimate.cov, axis1=1, axis2=2).min()
+    if smallest <= 0:
+        raise EstimationError(f"{name}: a pose variance is {smallest:.2g}, must be positive")
+    return estimate
+
+
+def _conclude(recording: Recording, motions: RelativeMotions, problem: Problem, estimate: Estimate,
+              estimator: Estimator, reason: str | None, stages: Stages) -> Refinement:
+    times = problem.t_s
+    only, bridged = chain_motions(motions, times, problem.motions.T_body_camera, estimate.T_world_body[0])
+    return Refinement(
+        name=recording.name, estimator=estimator, fallback_reason=reason,
+        trajectory=Trajectory(times, estimate.T_world_body, estimate.cov), velocity_m_s=estimate.velocity_m_s,
+        gyro_bias_rad_s=estimate.gyro_bias_rad_s, accel_bias_m_s2=estimate.accel_bias_m_s2,
+        log_scale=estimate.log_scale, log_scale_sd=estimate.log_scale_sd, motions_only=only, scale=estimate.scale,
+        imu=ImuConclusion(estimate.imu_chi2_per_dof, estimate.imu_inflation, problem.gaps),
+        motions_used=len(motions) - len(estimate.rejected), rejected=estimate.rejected, bridged=bridged,
+        time_offset_s=recording.calibration.time_offset_s, truth=_truth(recording, times),
+        timing_s=dict(stages.seconds), peak_rss_bytes=_peak_rss_bytes(),
+    )
+
+
+def _truth(recording: Recording, times: Array) -> Trajectory | None:
+    if recording.truth is None:
+        return None
+    inside = (times >= recording.truth.t_s[0] - 1e-9) & (times <= recording.truth.t_s[-1] + 1e-9)
+    return recording.truth.interpolate(times[inside]) if inside.any() else None
+
+
+def _peak_rss_bytes() -> int:
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return peak if sys.platform == "darwin" else peak * 1024

@@ -1,0 +1,78 @@
+"""What refinement concludes: one typed value that every estimator fills and the run folder writes."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vio.imu import Gap
+from vio.trajectory import Trajectory
+
+Array = NDArray[np.float64]
+Estimator = Literal["graph", "ekf", "motions"]
+ScalePolicy = Literal["free", "prior", "fixed"]
+
+
+@dataclass(frozen=True)
+class ScaleConclusion:
+    """How metric scale was obtained: ln(metres per motion unit), and why."""
+
+    policy: ScalePolicy
+    log_mean: float
+    """Mean over the recording of the estimated (or assumed) log scale."""
+    log_sd: float
+    """Standard deviation of that mean as claimed; the prior's where scale was not estimated."""
+    reason: str
+
+
+@dataclass(frozen=True)
+class ImuConclusion:
+    """How well the inertial data agree with the rest."""
+
+    chi2_per_dof: float | None
+    """Of the inertial factors in the fixed-scale pass; None where no graph was solved."""
+    inflation: float
+    """Factor on the accelerometer density that the scale policy asked for; 1 = as calibrated."""
+    gaps: tuple[Gap, ...]
+    """Holes over 0.5 s; their frame intervals carry no inertial factor."""
+
+
+@dataclass(frozen=True)
+class Refinement:
+    """One refined recording of M frames."""
+
+    name: str
+    """Name of the recording."""
+    estimator: Estimator
+    fallback_reason: str | None
+    """Why an earlier estimator was not used; None when the first choice held."""
+    trajectory: Trajectory
+    """M poses of the body in the world with covariances; position and yaw are relative to the first pose."""
+    velocity_m_s: Array
+    """(M, 3) in the world."""
+    gyro_bias_rad_s: Array
+    """(M, 3)"""
+    accel_bias_m_s2: Array
+    """(M, 3)"""
+    log_scale: Array
+    """(M,) ln(metres per motion unit) at every frame."""
+    log_scale_sd: Array
+    """(M,)"""
+    motions_only: Trajectory
+    """The same M frames chained from the motions alone at the prior scale, from the refined first pose."""
+    scale: ScaleConclusion
+    imu: ImuConclusion
+    motions_used: int
+    rejected: NDArray[np.int64]
+    """Indices of the motions that were gated as outliers."""
+    bridged: int
+    """Frame pairs that no motion measures; `motions_only` stands still there."""
+    time_offset_s: float
+    """Camera-IMU time offset applied (from calibration)."""
+    truth: Trajectory | None
+    """Truth at the frames it covers, when the recording has any."""
+    timing_s: dict[str, float] = field(default_factory=dict)
+    peak_rss_bytes: int = 0

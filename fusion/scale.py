@@ -1,0 +1,91 @@
+"""Metric scale: when the data may free it, when a prior carries it, when it is held, and why."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fusion.config import ScaleConfig
+from fusion.problem import Problem
+from fusion.result import ScaleConclusion
+
+Array = NDArray[np.float64]
+
+VAGUE_PRIOR_SD = 0.5
+"""Prior sd of the log scale above which the fixed-scale pass starts from a search instead of the mean."""
+PLAUSIBLE_SDS = 4.0
+"""How many prior sds the freed scale may move before it is disbelieved."""
+PLAUSIBLE_REJECTED = 0.15
+"""Share of motions that may be gated before the freed scale is disbelieved."""
+INFORMATIVE = 0.5
+"""The freed scale's sd must be below this share of the prior's to count as measured."""
+INFLATION_LADDER = (3.0, 10.0, 50.0)
+
+
+@dataclass(frozen=True)
+class Segments:
+    """Stretches of the recording that share one log scale."""
+
+    of_node: NDArray[np.int64]
+    """(M,) segment of every node."""
+    t_s: Array
+    """(K,) centre of every segment."""
+
+
+@dataclass(frozen=True)
+class FreePass:
+    """What freeing the scale led to, for the policy to judge."""
+
+    imu_chi2: float
+    log_scale: Array
+    log_scale_sd: Array
+    rejected_share: float
+
+
+def make_segments(t_s: Array, length_s: float) -> Segments:
+    """Cut nodes into equal stretches of about `length_s`, at least one."""
+    span = max(float(t_s[-1] - t_s[0]), 1e-9)
+    count = max(1, round(span / length_s))
+    of_node = np.minimum(((t_s - t_s[0]) / span * count).astype(np.int64), count - 1)
+    centres = t_s[0] + (np.arange(count) + 0.5) * span / count
+    # Sparse frames can leave a stretch empty: renumber what is there.
+    present, of_node = np.unique(of_node, return_inverse=True)
+    return Segments(of_node.astype(np.int64), centres[present])
+
+
+def imu_chi2(native_error: float, usable_intervals: int) -> float:
+    """2 × cost of the inertial factors and priors over six per interval.
+
+    A rough normaliser, not a true number of degrees of freedom: about 0.5 when all is well.
+    """
+    return 2 * native_error / (6 * max(usable_intervals, 1))
+
+
+def reasons_against(free: FreePass, problem: Problem, config: ScaleConfig) -> str | None:
+    """Why the freed scale must not be believed; None when it may."""
+    if free.imu_chi2 > config.imu_chi2_limit:
+        return (f"the IMU disagrees with the motions even with free scale (chi² {free.imu_chi2:.2f} per dof, "
+                f"limit {config.imu_chi2_limit:g}): the body moves in ways the camera does not see")
+    moved = abs(float(free.log_scale.mean()) - problem.scale_log_mean)
+    allowed = PLAUSIBLE_SDS * problem.scale_log_sd + 3 * float(free.log_scale_sd.mean())
+    if moved > allowed:
+        return (f"freed scale moved {moved:.2f} in log from the prior, more than {PLAUSIBLE_SDS:g} prior sds "
+                f"({allowed:.2f})")
+    if free.rejected_share > PLAUSIBLE_REJECTED:
+        return (f"freeing the scale rejected {100 * free.rejected_share:.0f} % of the motions "
+                f"(limit {100 * PLAUSIBLE_REJECTED:.0f} %)")
+    return None
+
+
+def conclude_free(free: FreePass, problem: Problem) -> ScaleConclusion:
+    """Name the outcome of an accepted free pass: measured by the IMU, or carried by the prior."""
+    mean, sd = float(free.log_scale.mean()), float(np.sqrt(np.mean(free.log_scale_sd**2)))
+    if sd > INFORMATIVE * problem.scale_log_sd:
+        return ScaleConclusion("prior", mean, sd,
+                               f"too little acceleration to measure scale: its sd {sd:.3f} is more than half the "
+                               f"prior's {problem.scale_log_sd:.3f}, so the prior carries it")
+    return ScaleConclusion("free", mean, sd,
+                           f"measured by the IMU: sd {sd:.3f} in log against the prior's {problem.scale_log_sd:.3f}, "
+                           f"IMU chi² {free.imu_chi2:.2f} per dof")

@@ -1,0 +1,131 @@
+"""The scaled relative-motion factor, linearised for all motions at once in numpy.
+
+A motion source reports the CAMERA's motion `T_i_j` with translation in its own units. With body poses
+X_i, X_j, camera pose `T_body_camera` = (R_bc, t_bc) and log scale s, the residual is in the source's units:
+
+    R_pred = R_bcᵀ R_iᵀ R_j R_bc
+    t_pred = R_bcᵀ (R_iᵀ (p_j - p_i) + R_iᵀ R_j t_bc - t_bc)            [m]
+    e_R    = Log(R_measᵀ R_pred)                                         [rad]
+    e_t    = R_measᵀ (exp(-s) t_pred - t_meas)                           [motion units]
+
+Residuals in metres, `t_pred - exp(s) t_meas`, would pull s down (errors in variables); these do not.
+No Python callback runs inside a C++ optimiser: gtsam copies all values for each call, which is
+quadratic in the number of frames.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vio import se3
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class ScaledMotions:
+    """N motions between nodes i and j, ready to be linearised."""
+
+    i: NDArray[np.int64]
+    """(N,) node of the first frame."""
+    j: NDArray[np.int64]
+    """(N,) node of the second frame, larger than i."""
+    R: Array
+    """(N, 3, 3) measured rotation of camera j in camera i."""
+    t: Array
+    """(N, 3) measured translation, motion units."""
+    whiten: Array
+    """(N, 6, 6) inverse Cholesky factor of the covariance of [e_R, e_t]."""
+    T_body_camera: Array
+    """(4, 4)"""
+
+    def __len__(self) -> int:
+        return len(self.i)
+
+    def select(self, index: NDArray[np.int64] | NDArray[np.bool_], first_node: int = 0) -> ScaledMotions:
+        """The motions at `index`, with nodes renumbered from `first_node`."""
+        return ScaledMotions(self.i[index] - first_node, self.j[index] - first_node, self.R[index], self.t[index],
+                             self.whiten[index], self.T_body_camera)
+
+    def body_rotation(self) -> Array:
+        """(N, 3, 3) measured rotation of body j in body i."""
+        R_bc = self.T_body_camera[:3, :3]
+        return R_bc @ self.R @ R_bc.T
+
+    def body_motion(self, log_scale: float) -> Array:
+        """(N, 4, 4) metric motion of the body at a given log scale."""
+        metric = se3.transform(self.R, self.t * np.exp(log_scale))
+        return self.T_body_camera @ metric @ se3.inverse(self.T_body_camera)
+
+
+@dataclass(frozen=True)
+class Linearized:
+    """Whitened Gauss-Newton blocks of N motions around the current state."""
+
+    A_i: Array
+    """(N, 6, 6) with respect to pose i, right perturbation, rotation first."""
+    A_j: Array
+    """(N, 6, 6) with respect to pose j."""
+    A_s: Array
+    """(N, 6, 1) with respect to the log scale."""
+    b: Array
+    """(N, 6) right-hand side, minus the whitened residual."""
+    squared_norm: Array
+    """(N,) whitened residual squared, before any robust weight."""
+
+
+def make_motions(i: NDArray[np.int64], j: NDArray[np.int64], T_i_j: Array, cov: Array,
+                 T_body_camera: Array) -> ScaledMotions:
+    """Whiten measured motions (N, 4, 4) with their right-perturbation covariances (N, 6, 6)."""
+    lower = np.linalg.cholesky(cov)
+    return ScaledMotions(i, j, T_i_j[:, :3, :3], T_i_j[:, :3, 3], np.linalg.inv(lower), T_body_camera)
+
+
+def residuals(motions: ScaledMotions, R: Array, p: Array, log_scale: Array) -> Array:
+    """Whitened residuals (N, 6) at body poses R (M, 3, 3), p (M, 3) and per-motion log scales (N,)."""
+    R_pred, t_pred, _ = _predict(motions, R, p)
+    return _whitened(motions, R_pred, t_pred, np.exp(-log_scale))
+
+
+def linearize(motions: ScaledMotions, R: Array, p: Array, log_scale: Array) -> Linearized:
+    """Linearise all motions at body poses R (M, 3, 3), p (M, 3) [m] and per-motion log scales (N,)."""
+    R_bc, t_bc = motions.T_body_camera[:3, :3], motions.T_body_camera[:3, 3]
+    inverse_scale = np.exp(-log_scale)
+    R_pred, t_pred, (R_ij, t_ij) = _predict(motions, R, p)
+    r = _whitened(motions, R_pred, t_pred, inverse_scale)
+
+    R_meas_t = np.swapaxes(motions.R, 1, 2)
+    J_inverse = se3.so3_right_jacobian_inverse(se3.so3_log(R_meas_t @ R_pred))
+    to_units = inverse_scale[:, None, None] * (R_meas_t @ R_bc.T)
+    n = len(motions)
+    D_i, D_j, D_s = np.zeros((n, 6, 6)), np.zeros((n, 6, 6)), np.zeros((n, 6, 1))
+    D_i[:, :3, :3] = -J_inverse @ np.swapaxes(R_bc @ R_pred, 1, 2)
+    D_j[:, :3, :3] = J_inverse @ R_bc.T
+    D_i[:, 3:, :3] = to_units @ se3.skew(t_ij + R_ij @ t_bc)
+    D_i[:, 3:, 3:] = -to_units
+    D_j[:, 3:, :3] = -to_units @ R_ij @ se3.skew(t_bc)
+    D_j[:, 3:, 3:] = to_units @ R_ij
+    D_s[:, 3:, 0] = -inverse_scale[:, None] * (R_meas_t @ t_pred[:, :, None])[:, :, 0]
+    W = motions.whiten
+    return Linearized(W @ D_i, W @ D_j, W @ D_s, -r, np.einsum("nk,nk->n", r, r))
+
+
+def _predict(motions: ScaledMotions, R: Array, p: Array) -> tuple[Array, Array, tuple[Array, Array]]:
+    """Predicted camera rotation and metric translation, and the body's (R_ij, t_ij)."""
+    R_bc, t_bc = motions.T_body_camera[:3, :3], motions.T_body_camera[:3, 3]
+    R_i_t = np.swapaxes(R[motions.i], 1, 2)
+    R_ij = R_i_t @ R[motions.j]
+    t_ij = (R_i_t @ (p[motions.j] - p[motions.i])[:, :, None])[:, :, 0]
+    t_pred = (t_ij + R_ij @ t_bc - t_bc) @ R_bc
+    return R_bc.T @ R_ij @ R_bc, t_pred, (R_ij, t_ij)
+
+
+def _whitened(motions: ScaledMotions, R_pred: Array, t_pred: Array, inverse_scale: Array) -> Array:
+    R_meas_t = np.swapaxes(motions.R, 1, 2)
+    e_R = se3.so3_log(R_meas_t @ R_pred)
+    e_t = (R_meas_t @ (inverse_scale[:, None] * t_pred - motions.t)[:, :, None])[:, :, 0]
+    whitened: Array = (motions.whiten @ np.concatenate([e_R, e_t], axis=1)[:, :, None])[:, :, 0]
+    return whitened

@@ -1,0 +1,30 @@
+"""Named stages of a long computation: how long each took, and a word to whoever watches."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+
+
+class Stages:
+    """Times stages; a stage entered twice adds up.
+
+    Args:
+        announce: called with the name of every stage as it begins.
+    """
+
+    def __init__(self, announce: Callable[[str], None] | None = None) -> None:
+        self.seconds: dict[str, float] = {}
+        self._announce = announce
+
+    @contextmanager
+    def __call__(self, name: str) -> Iterator[None]:
+        """Run the block as stage `name`."""
+        if self._announce is not None:
+            self._announce(name)
+        begun = time.perf_counter()
+        try:
+            yield
+        finally:
+            self.seconds[name] = self.seconds.get(name, 0.0) + time.perf_counter() - begun

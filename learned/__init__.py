@@ -1,0 +1,12 @@
+"""What is predicted: camera motions and depth maps from frames and vibration, by networks in torch.
+
+    import vio, learned
+    recording = vio.open_recording("examination/")
+    motions = learned.predict(recording, predictor)
+"""
+
+from learned.errors import PredictionError, WeightsError
+from learned.predict import Prediction, predict
+from learned.predictor import PairPrediction, Predictor
+
+__all__ = ["PairPrediction", "Prediction", "PredictionError", "Predictor", "WeightsError", "predict"]

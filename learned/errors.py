@@ -1,0 +1,11 @@
+"""What can go wrong between a recording and the motions a network predicts for it."""
+
+from vio.errors import VioError
+
+
+class WeightsError(VioError):
+    """Weights that are missing or that no network of this version can load."""
+
+
+class PredictionError(VioError):
+    """A predictor whose output breaks its contract: wrong shape, or a value that is not finite."""

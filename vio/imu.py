@@ -1,0 +1,183 @@
+"""Inertial samples, their noise, and how they are cut at frame times.
+
+Conventions: gyro in rad/s, accelerometer = specific force in m/s² (at rest +9.81 upward), both in
+body axes. A stamp is the CENTRE of the time the sensor averaged over, so a sample speaks for the
+span half-way to its neighbours (its cell). Noise figures are continuous densities.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from vio import se3
+from vio.errors import ImuError
+
+Array = NDArray[np.float64]
+
+GRAVITY_M_S2 = 9.81
+GAP_LIMIT_S = 0.5
+
+
+@dataclass(frozen=True)
+class ImuNoise:
+    """Continuous noise of one IMU. Defaults: Bosch BMI270 data sheet, as a capsule might carry.
+
+    A data sheet's "angle random walk" is the *density* here; the `*_walk_*` fields are bias walks.
+    """
+
+    gyro_density_rad_s_rthz: float = 1.22e-4
+    accel_density_m_s2_rthz: float = 1.57e-3
+    gyro_walk_rad_s2_rthz: float = 2e-6
+    accel_walk_m_s3_rthz: float = 1e-4
+    rate_hz: float = 40.0
+    gyro_range_rad_s: float | None = None
+    """Full scale of the gyro; None when unknown (saturation is then found by repeated extremes)."""
+    accel_range_m_s2: float | None = None
+    """Full scale of the accelerometer; None when unknown."""
+
+    def __post_init__(self) -> None:
+        for name in ("gyro_density_rad_s_rthz", "accel_density_m_s2_rthz", "gyro_walk_rad_s2_rthz",
+                     "accel_walk_m_s3_rthz", "rate_hz"):
+            value = getattr(self, name)
+            if not (np.isfinite(value) and value > 0):
+                raise ImuError(f"imu noise: {name} is {value}, must be a positive number; see the sensor's data sheet")
+
+
+@dataclass(frozen=True)
+class ImuSamples:
+    """N inertial samples in body axes."""
+
+    t_ns: NDArray[np.int64]
+    """(N,) stamps in nanoseconds, on the clock of the recording."""
+    gyro_rad_s: Array
+    """(N, 3) angular rate."""
+    accel_m_s2: Array
+    """(N, 3) specific force."""
+
+    def __len__(self) -> int:
+        return len(self.t_ns)
+
+
+@dataclass(frozen=True)
+class Gap:
+    """A hole in the IMU stream, in seconds on the clock the caller used."""
+
+    start_s: float
+    end_s: float
+
+
+@dataclass(frozen=True)
+class ImuPieces:
+    """The IMU between consecutive frames, as constant pieces: what a preintegrator is fed.
+
+    Interval k (frame k to k+1) owns pieces `first[k]:first[k+1]`.
+    """
+
+    gyro_rad_s: Array
+    """(P, 3)"""
+    accel_m_s2: Array
+    """(P, 3) specific force in body axes at the START of the piece."""
+    dt_s: Array
+    """(P,) lengths, all positive; they add up to the frame interval."""
+    first: NDArray[np.int64]
+    """(M+1,) index of each interval's first piece."""
+    longest_s: Array = field(repr=False)
+    """(M,) distance between neighbouring stamps at its largest within each interval."""
+
+
+def find_gaps(t_s: ArrayLike, limit_s: float = GAP_LIMIT_S) -> list[Gap]:
+    """Holes longer than `limit_s` between consecutive stamps (N,) [s]."""
+    t = np.asarray(t_s, float)
+    return [Gap(float(t[k]), float(t[k + 1])) for k in np.flatnonzero(np.diff(t) > limit_s)]
+
+
+def check_coverage(imu_t_s: Array, frame_t_s: Array) -> None:
+    """Make sure that the samples reach from the first frame to the last.
+
+    Raises:
+        ImuError: a frame lies more than one sample period before or after all samples.
+    """
+    if len(imu_t_s) == 0:
+        raise ImuError("imu: no samples; give a stream that covers all frames")
+    period = float(np.median(np.diff(imu_t_s))) if len(imu_t_s) > 1 else 0.0
+    slack = 1.5 * period
+    late, early = imu_t_s[0] - frame_t_s[0], frame_t_s[-1] - imu_t_s[-1]
+    if late > slack or early > slack:
+        raise ImuError(
+            f"imu covers {imu_t_s[0]:.3f} to {imu_t_s[-1]:.3f} s but frames run from {frame_t_s[0]:.3f} to "
+            f"{frame_t_s[-1]:.3f} s; give the whole IMU log or cut the frames (limit: one sample, {slack:.3f} s)"
+        )
+
+
+def split_at_frames(samples: ImuSamples, imu_t_s: ArrayLike, frame_t_s: ArrayLike) -> ImuPieces:
+    """Cut every sample's cell at the frame times, and turn each force into the axes at its piece's start.
+
+    A piece takes its sample's average, carried along the signal's slope from the sample's stamp to the
+    piece's centre: this leaves whole cells as they are and tells the two halves of a cut one apart.
+    A zero-order-hold integrator rotates a force with the attitude at the START of the step, while a
+    sensor averages over its whole cell. Rotating the force by the gyro from piece centre to piece
+    start, `Exp(omega dt / 2) f`, removes the leak of gravity that would follow.
+
+    Args:
+        samples: N samples.
+        imu_t_s: (N,) their stamps on the frames' clock [s], strictly increasing.
+        frame_t_s: (M+1,) frame times [s], strictly increasing, covered by the samples.
+
+    Raises:
+        ImuError: the samples do not reach over all frames.
+    """
+    t, frames = np.asarray(imu_t_s, float), np.asarray(frame_t_s, float)
+    check_coverage(t, frames)
+    middle = 0.5 * (t[1:] + t[:-1])
+    inner = middle[(middle > frames[0]) & (middle < frames[-1])]
+    cuts = np.union1d(inner, frames)
+    start, dt = cuts[:-1], np.diff(cuts)
+    owner = np.searchsorted(middle, start + 0.5 * dt)
+    keep = dt > 1e-9  # stamps and frames closer than a nanosecond are the same instant
+    start, dt, owner = start[keep], dt[keep], owner[keep]
+    interval = np.searchsorted(frames, start + 0.5 * dt) - 1
+    m = len(frames) - 1
+    length = np.bincount(interval, weights=dt, minlength=m)
+    dt = dt * (np.diff(frames) / length)[interval]
+    offset = (start + 0.5 * dt - t[owner])[:, None]
+    gyro = samples.gyro_rad_s[owner] + offset * _slope(samples.gyro_rad_s, t)[owner]
+    force = samples.accel_m_s2[owner] + offset * _slope(samples.accel_m_s2, t)[owner]
+    turn = se3.so3_exp(gyro * (0.5 * dt)[:, None])
+    accel = (turn @ force[:, :, None])[:, :, 0]
+    first = np.searchsorted(interval, np.arange(m + 1))
+    return ImuPieces(gyro, accel, dt, first.astype(np.int64), _longest_spacing(t, frames))
+
+
+def _slope(signal: Array, t: Array) -> Array:
+    """(N, 3) central differences per second, one-sided at the ends."""
+    if len(t) < 2:
+        return np.zeros_like(signal)
+    padded = np.concatenate([signal[:1], signal, signal[-1:]])
+    span = np.concatenate([t[:1], t, t[-1:]])
+    slope: Array = (padded[2:] - padded[:-2]) / (span[2:] - span[:-2])[:, None]
+    return slope
+
+
+def _longest_spacing(t: Array, frames: Array) -> Array:
+    """(M,) largest distance between neighbouring stamps that touches each frame interval."""
+    spacing = np.diff(t)
+    lo = np.clip(np.searchsorted(t, frames[:-1], "right") - 1, 0, len(spacing) - 1)
+    hi = np.clip(np.searchsorted(t, frames[1:], "left"), lo + 1, len(spacing))
+    edges = np.column_stack([lo, hi]).ravel()
+    padded = np.append(spacing, 0.0)
+    return np.maximum.reduceat(padded, edges)[::2]
+
+
+def preintegrate_rotation(pieces: ImuPieces, gyro_bias_rad_s: ArrayLike) -> Array:
+    """Gyro rotation (M, 3, 3) from each frame to the next, `R_body_k_body_k1`, with a constant bias removed."""
+    bias = np.asarray(gyro_bias_rad_s, float)
+    steps = se3.so3_exp((pieces.gyro_rad_s - bias) * pieces.dt_s[:, None])
+    counts = np.diff(pieces.first)
+    out = np.broadcast_to(np.eye(3), (len(counts), 3, 3)).copy()
+    for offset in range(int(counts.max(initial=0))):
+        active = counts > offset
+        out[active] = out[active] @ steps[pieces.first[:-1][active] + offset]
+    return out
