@@ -17,6 +17,7 @@ from vio.trajectory import Trajectory
 
 TITLES = {"none": "none", "origin": "origin", "yaw4": "yaw4", "se3": "SE3", "sim3": "Sim3"}
 VERDICT_ALIGNMENT = "se3"
+MOTIONS_ONLY, REFINED = ": motions only", ": refined"
 
 
 @dataclass(frozen=True)
@@ -108,8 +109,8 @@ def _truth_of(folder: Path) -> Trajectory | None:
 
 
 def _run_names(run: Run, taken: dict[str, Trajectory]) -> tuple[str, str]:
-    base = _free_name(run.name, {name.removesuffix(" motions"): t for name, t in taken.items()})
-    return f"{base} motions", f"{base} {run.summary['estimator']}"
+    base = _free_name(run.name, {name.removesuffix(REFINED): t for name, t in taken.items()})
+    return base + MOTIONS_ONLY, base + REFINED
 
 
 def _free_name(name: str, taken: dict[str, Trajectory]) -> str:

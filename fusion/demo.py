@@ -37,7 +37,7 @@ def run_demo(out: Path, seed: int, announce: Callable[[str], None] | None = None
     """
     say = announce or (lambda _: None)
     say("simulating 1000 frames in the small bowel, vibration level 3")
-    simulated = simulate_recording(ORGAN, VIBRATION, LEVEL, (FRAMES - 1) / FRAME_RATE_HZ, seed)
+    simulated = simulate_recording(ORGAN, VIBRATION, LEVEL, FRAMES / FRAME_RATE_HZ, seed)
     write_asl(simulated, out / "recording")
     recording = read_asl(out / "recording")
     network = network_like_motions(recording.truth_at_frames(), recording.calibration.T_body_camera, seed)

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from typing import Any
 
-import numpy as np
-
 from fusion.result import Refinement
 from vio import se3
 from vio.alignment import associate
@@ -53,5 +51,4 @@ def accuracy_of(estimates: dict[str, Trajectory], truth: Trajectory) -> dict[str
 def _paper_metrics(estimate: Trajectory, truth: Trajectory) -> dict[str, Any]:
     matched, reference = associate(estimate, truth)
     steps = [se3.inverse(t.T_world_body[:-1]) @ t.T_world_body[1:] for t in (matched, reference)]
-    return {key: float(value) if np.isscalar(value) else value
-            for key, value in paper_motion_metrics(steps[0], steps[1]).items()}
+    return dict(paper_motion_metrics(steps[0], steps[1]))

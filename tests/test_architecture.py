@@ -29,7 +29,7 @@ HEAVY = {
     "plotly": ("fusion/report/",),
     "matplotlib": ("fusion/report/",),
     "tqdm": (COMMAND_LINE,),
-    "argparse": (COMMAND_LINE,),
+    "argparse": (COMMAND_LINE, "fusion/cli_parser.py"),
     "evo": (),
     "pytest": (),
     "hypothesis": (),
@@ -65,7 +65,7 @@ def imports(file: Path) -> Iterator[str]:
             assert node.level == 0, f"{name_of(file)}:{node.lineno}: relative import; write the package's name"
             yield (node.module or "").split(".")[0]
         elif isinstance(node, ast.Call) and ast.unparse(node.func) in ("import_module", "importlib.import_module"):
-            yield ast.literal_eval(node.args[0]).split(".")[0]
+            yield from (arg.value.split(".")[0] for arg in node.args[:1] if isinstance(arg, ast.Constant))
 
 
 def our_files() -> list[Path]:

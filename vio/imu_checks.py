@@ -106,7 +106,7 @@ def _check_stamps(samples: ImuSamples) -> Array:
     if n < 2:
         raise ImuError(f"imu: {n} samples; at least 2 are needed")
     t = samples.t_ns
-    bad = np.diff(t) <= 0
+    bad = t[1:] <= t[:-1]
     if bad.any():
         k = int(np.argmax(bad)) + 1
         word = "repeats" if t[k] == t[k - 1] else "is earlier than"

@@ -72,8 +72,8 @@ class Recording:
             raise RecordingError(f"recording {self.name}: frame_t_ns must be int64 (N,), is {t.dtype} {t.shape}")
         if len(t) == 0:
             raise RecordingError(f"recording {self.name}: no frames; cam0/data.csv must list at least one time")
-        if (np.diff(t) <= 0).any():
-            k = int(np.argmax(np.diff(t) <= 0)) + 1
+        if (t[1:] <= t[:-1]).any():
+            k = int(np.argmax(t[1:] <= t[:-1])) + 1
             raise RecordingError(f"recording {self.name}: frame {k} at {t[k]} ns does not follow {t[k - 1]} ns; "
                                  "sort the frames and drop duplicates")
         object.__setattr__(self, "frame_t_ns", t)

@@ -134,7 +134,7 @@ def _tiles(refinement: Refinement, summary: Mapping[str, Any], scene: Scene) -> 
     error = (accuracy.get("refined") or {}).get("scale_error")
     if isinstance(error, (int, float)):
         tiles.append(("Scale error", words.percent(error), "refined path against truth"))
-    tiles.append(("Scale", refinement.scale.policy, f"± {100 * refinement.scale.log_sd:.2g} % claimed"))
+    tiles.append(("Scale", refinement.scale.policy, f"{words.spread(refinement.scale.log_sd)} claimed"))
     if scene.claimed_sd_m is not None:
         tiles.append(("Claimed 3 sigma", words.length(3 * scene.claimed_sd_m[-1]), "position of the last frame"))
     rejected, total = len(refinement.rejected), len(refinement.rejected) + refinement.motions_used
@@ -190,7 +190,7 @@ def _paper(metrics: Mapping[str, Any]) -> str:
 
 
 def _colophon(summary: Mapping[str, Any]) -> str:
-    parts = [f"{stage} {seconds:.2g} s" for stage, seconds in (summary.get("timing_s") or {}).items()]
+    parts = [f"{stage.replace('_', ' ')} {seconds:.2g} s" for stage, seconds in (summary.get("timing_s") or {}).items()]
     if summary.get("peak_rss_bytes"):
         parts.append(f"{summary['peak_rss_bytes'] / 2**20:,.0f} MiB at most")
     return "Computed in: " + ", ".join(parts) + "." if parts else ""

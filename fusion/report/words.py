@@ -49,6 +49,11 @@ def percent(share: float) -> str:
     return figure.replace("-", "−") + f"{NBSP}%"
 
 
+def spread(log_sd: float) -> str:
+    """A standard deviation in log as a relative one."""
+    return f"±{NBSP}{100 * math.expm1(log_sd):.2g}{NBSP}%"
+
+
 def duration(seconds: float) -> str:
     """A time span as people say it."""
     if seconds < 120:
@@ -121,7 +126,7 @@ def sentences(
         out.append(("Fallback", f"The first choice was not used: {_ended(refinement.fallback_reason)}"))
     scale = refinement.scale
     out.append(("Scale", f"{_begun(POLICIES[scale.policy])}: one motion unit is "
-                         f"{length(math.exp(scale.log_mean))} ± {100 * math.expm1(scale.log_sd):.2g} % (1 sd). "
+                         f"{length(math.exp(scale.log_mean))} {spread(scale.log_sd)} (1 sd). "
                          f"Why: {_ended(scale.reason)}"))
     out.append(("IMU", _imu(refinement)))
     out.append(("Motions", _motions(refinement)))

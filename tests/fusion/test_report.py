@@ -29,14 +29,16 @@ SVG = "{http://www.w3.org/2000/svg}"
 
 
 def refinement_of(n: int = 400, sd_m: float = 5e-4, claim: float = 1.0, seed: int = 3, **changes) -> Refinement:
-    """A winding track; refined positions are off by independent noise of `sd_m`, claimed as `claim` times that."""
+    """A winding track; refined positions are off by noise of `sd_m` along body x and less along y and z, claimed as
+    `claim` times that."""
     rng = np.random.default_rng(seed)
     t, u = np.arange(n) / 4, np.linspace(0, 1, n)
     p = np.column_stack([np.sin(9 * u), np.cos(5 * u), np.sin(4 * u + 1)]) * 0.1
     T = se3.transform(se3.so3_exp(np.column_stack([0.2 * np.sin(7 * u), u, 3 * u])), p)
-    noise = rng.normal(size=(n, 3)) * sd_m
+    sd_body = sd_m * np.array([1.0, 0.1, 0.4])
+    noise = (T[:, :3, :3] @ (rng.normal(size=(n, 3)) * sd_body)[..., None])[..., 0]
     noise[0] = 0
-    cov = np.broadcast_to(np.diag(np.r_[[1e-4] * 3, [(claim * sd_m) ** 2] * 3]), (n, 6, 6)).copy()
+    cov = np.broadcast_to(np.diag(np.r_[[1e-4] * 3, (claim * sd_body) ** 2]), (n, 6, 6)).copy()
     rejected = np.array([k for k in (5, 60, 61) if k < n - 1])
     motions = T.copy()
     motions[:, :3, 3] += np.cumsum(rng.normal(size=(n, 3)) * 1e-3, axis=0)

@@ -33,31 +33,37 @@ def cut_problems(draw):
     return samples, t, frames
 
 
-@given(cut_problems())
-def test_pieces_fill_every_interval_with_the_samples_own_cells(problem):
+@given(cut_problems(), st.lists(st.floats(-3, 3), min_size=12, max_size=12))
+def test_signals_that_change_steadily_are_cut_exactly(problem, coefficients):
+    # Whatever the stamps and the cuts: rates a + b t integrate exactly, forces are turned from piece centre to start.
     samples, t, frames = problem
+    a, b, c, d = np.reshape(coefficients, (4, 3))
+    samples = replace(samples, gyro_rad_s=a + b * t[:, None], accel_m_s2=c + d * t[:, None])
     pieces = split_at_frames(samples, t, frames)
     assert pieces.first[0] == 0 and pieces.first[-1] == len(pieces.dt_s) and (pieces.dt_s > 0).all()
-    edges = np.concatenate([[t[0] - 1], 0.5 * (t[1:] + t[:-1]), [t[-1] + 1]])
-    total = np.vstack([np.zeros(3), np.cumsum(samples.gyro_rad_s * np.diff(edges)[:, None], axis=0)])
-    integral = np.column_stack([np.interp(frames, edges, total[:, axis]) for axis in range(3)])
+    centre = frames[0] + np.cumsum(pieces.dt_s) - 0.5 * pieces.dt_s
+    half_turn = se3.so3_exp((a + b * centre[:, None]) * 0.5 * pieces.dt_s[:, None])
+    np.testing.assert_allclose(pieces.accel_m_s2, (half_turn @ (c + d * centre[:, None])[..., None])[..., 0], atol=1e-6)
     for k in range(len(frames) - 1):
-        part = slice(pieces.first[k], pieces.first[k + 1])
-        np.testing.assert_allclose(pieces.dt_s[part].sum(), frames[k + 1] - frames[k], rtol=1e-12)
+        part, (lo, hi) = slice(pieces.first[k], pieces.first[k + 1]), frames[k:k + 2]
+        np.testing.assert_allclose(pieces.dt_s[part].sum(), hi - lo, rtol=1e-12)
         turned = pieces.dt_s[part] @ pieces.gyro_rad_s[part]
-        np.testing.assert_allclose(turned, integral[k + 1] - integral[k], atol=1e-7)
+        np.testing.assert_allclose(turned, a * (hi - lo) + b * (hi**2 - lo**2) / 2, atol=1e-7)
 
 
 @given(cut_problems())
-@settings(max_examples=30)
-def test_forces_are_turned_to_the_start_of_their_piece(problem):
-    samples, t, frames = problem
+def test_a_sample_keeps_its_average_over_its_cell_however_it_is_cut(problem):
+    samples, _, cuts = problem
+    t = np.arange(len(samples)) * 0.025
+    inside = np.interp(cuts, [cuts[0], cuts[-1]], [t[0], t[-1]])
+    frames = np.union1d(inside, t[1:] - 0.0125)  # every cell edge, and cuts anywhere between
+    frames = frames[np.diff(frames, prepend=-1.0) > 1e-6]
     pieces = split_at_frames(samples, t, frames)
-    start = frames[0] + np.concatenate([[0], np.cumsum(pieces.dt_s)])[:-1]
-    for k in range(len(start)):
-        owner = np.argmin(np.abs(t - (start[k] + 0.5 * pieces.dt_s[k])))
-        R = expm(se3.skew(samples.gyro_rad_s[owner] * (t[owner] - start[k])))
-        np.testing.assert_allclose(pieces.accel_m_s2[k], R @ samples.accel_m_s2[owner], atol=1e-6)
+    end = frames[0] + np.cumsum(pieces.dt_s)
+    for k in range(1, len(t) - 1):
+        cell = (end > t[k] - 0.0125 + 1e-6) & (end < t[k] + 0.0125 + 1e-6)
+        turned = pieces.dt_s[cell] @ pieces.gyro_rad_s[cell]
+        np.testing.assert_allclose(turned, 0.025 * samples.gyro_rad_s[k], atol=2e-5)
 
 
 @given(cut_problems())
@@ -69,16 +75,16 @@ def test_longest_spacing_is_that_of_the_stamps_that_touch_an_interval(problem):
         assert longest[k] == pytest.approx(max(touching))
 
 
-def test_a_steady_turn_under_gravity_leaks_nothing():
-    # At a constant rate every piece must point its force exactly at the world's, whatever the frames cut.
+def test_a_steady_turn_under_gravity_hardly_leaks():
+    # At a constant rate every piece must point its force at the world's; turned by nothing it would be 0.28 m/s² off.
     rate, up = np.array([0.3, -2.0, 1.1]), np.array([0.0, 0.0, 9.81])
     t = np.arange(-0.1, 2.2, 0.025)
     force = np.stack([expm(-se3.skew(rate * time)) @ up for time in t])
     samples = ImuSamples((t * 1e9).astype(np.int64), np.tile(rate, (len(t), 1)), force)
     pieces = split_at_frames(samples, t, np.arange(0, 2.01, 0.333))
-    start = np.concatenate([[0], np.cumsum(pieces.dt_s)])[:-1]
+    start = np.cumsum(pieces.dt_s) - pieces.dt_s
     world = np.stack([expm(se3.skew(rate * time)) @ f for time, f in zip(start, pieces.accel_m_s2, strict=True)])
-    np.testing.assert_allclose(world, np.broadcast_to(up, world.shape), atol=1e-10)
+    np.testing.assert_allclose(world, np.broadcast_to(up, world.shape), atol=4e-3)
 
 
 @given(cut_problems(), st.tuples(st.floats(-1, 1), st.floats(-1, 1), st.floats(-1, 1)))

@@ -92,7 +92,7 @@ def parse_stamps(table: TextTable, error: type[VioError]) -> NDArray[np.int64]:
             stamps[k] = int(field)
         except (ValueError, OverflowError):
             raise error(f"{table.at(k)}: stamp {field!r} is not a whole number of nanoseconds") from None
-    bad = np.diff(stamps) <= 0
+    bad = stamps[1:] <= stamps[:-1]
     if bad.any():
         k = int(np.argmax(bad)) + 1
         word = "repeats" if stamps[k] == stamps[k - 1] else "is earlier than"

@@ -1,0 +1,177 @@
+"""The command line: `capsule-vio demo | doctor | simulate | inspect | predict | refine | compare`.
+
+Exit codes: 0 done; 2 wrong usage; 3 the input cannot be used; 4 no estimator produced a trajectory;
+1 a bug (traceback). Heavy libraries load only in the command that needs them.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+from fusion.cli_parser import build_parser
+from vio.errors import UsageError, VioError
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run one command and return its exit code."""
+    arguments = build_parser().parse_args(argv)
+    commands: dict[str, Callable[[argparse.Namespace], int]] = {
+        "demo": _demo, "doctor": _doctor, "simulate": _simulate, "inspect": _inspect, "predict": _predict,
+        "refine": _refine, "compare": _compare,
+    }
+    try:
+        return commands[arguments.command](arguments)
+    except VioError as error:
+        print(f"capsule-vio {arguments.command}: {error}", file=sys.stderr)
+        return error.exit_code
+    except KeyboardInterrupt:
+        print("interrupted; nothing half-written was kept", file=sys.stderr)
+        return 130
+
+
+def _announce(text: str) -> None:
+    print(f"… {text.replace('_', ' ')}", file=sys.stderr, flush=True)
+
+
+def _print_json(value: Any) -> None:
+    print(json.dumps(value, indent=2, sort_keys=True, allow_nan=False))
+
+
+def _demo(arguments: argparse.Namespace) -> int:
+    from fusion.compare import format_table
+    from fusion.demo import run_demo
+
+    demo = run_demo(arguments.out, arguments.seed, _announce)
+    if arguments.json:
+        _print_json(demo.comparison.to_dict())
+        return 0
+    print(format_table(demo.comparison))
+    print(f"report: {demo.report}\nplot:   {demo.plot}")
+    return 0
+
+
+def _doctor(arguments: argparse.Namespace) -> int:
+    from fusion.doctor import diagnose, format_findings
+
+    findings = diagnose()
+    if arguments.json:
+        _print_json([finding.__dict__ for finding in findings])
+    else:
+        print(format_findings(findings))
+    return 0 if all(finding.ok or not finding.required for finding in findings) else 3
+
+
+def _simulate(arguments: argparse.Namespace) -> int:
+    from vio.formats.asl import write_asl
+    from vio.simulation import network_like_motions, simulate_recording
+
+    if not arguments.no_images:
+        raise UsageError("rendered images are not part of this version; add --no-images for times, IMU and truth")
+    recording = simulate_recording(arguments.organ, arguments.vibration, arguments.level, arguments.duration, arguments.seed)
+    write_asl(recording, arguments.out)
+    if arguments.motions is not None:
+        truth, T_body_camera = recording.truth_at_frames(), recording.calibration.T_body_camera
+        network_like_motions(truth, T_body_camera, arguments.seed).motions.save(arguments.motions)
+    print(f"{arguments.out}: {len(recording)} frames, {len(recording.imu)} inertial samples, "
+          f"path {recording.truth_at_frames().path_length_m:.3f} m")
+    return 0
+
+
+def _inspect(arguments: argparse.Namespace) -> int:
+    from vio.formats import open_recording
+    from vio.inspection import format_inspection, inspect_recording
+
+    inspection = inspect_recording(open_recording(arguments.recording))
+    if arguments.json:
+        _print_json(inspection.to_dict())
+    else:
+        print(format_inspection(inspection))
+    if inspection.usable:
+        return 0
+    first = next(check for check in inspection.checks if check.level == "error")
+    print(f"capsule-vio inspect: {first.text}", file=sys.stderr)
+    return 3
+
+
+def _predict(arguments: argparse.Namespace) -> int:
+    from vio.formats import open_recording
+
+    recording = open_recording(arguments.recording)
+    if arguments.method == "classical":
+        from vio.odometry import measure_recording
+
+        motions = measure_recording(recording)
+    else:
+        import learned
+
+        motions = learned.predict(recording, arguments.weights, depth_dir=arguments.depth)
+    motions.save(arguments.out)
+    print(f"{arguments.out}: {len(motions)} motions")
+    return 0
+
+
+def _refine(arguments: argparse.Namespace) -> int:
+    from fusion.config import RefineConfig, load_config
+    from fusion.refine import refine
+    from fusion.run_folder import Provenance, write_run
+    from vio.formats import open_recording
+    from vio.motions import load_motions
+
+    config = RefineConfig() if arguments.config is None else load_config(arguments.config)
+    if arguments.estimator is not None:
+        config = replace(config, estimator=arguments.estimator)
+    recording = open_recording(arguments.recording)
+    inputs = {"imu": arguments.recording / "mav0" / "imu0" / "data.csv",
+              "frames": arguments.recording / "mav0" / "cam0" / "data.csv"}
+    if arguments.motions is not None:
+        motions = load_motions(arguments.motions)
+        inputs["motions"] = arguments.motions
+    else:
+        import learned
+
+        motions = learned.predict(recording, arguments.weights)
+    refined = refine(recording, motions, config, _announce)
+    command = ["refine", arguments.recording.name, "--out", arguments.out.name]
+    summary = write_run(refined, arguments.out, Provenance(command, config, inputs))
+    if arguments.json:
+        _print_json(summary)
+    else:
+        print(_sentences(summary))
+        print(f"run folder: {arguments.out}")
+    return 0
+
+
+def _sentences(summary: dict[str, Any]) -> str:
+    from fusion.compare import verdict
+
+    scale, fallback = summary["scale"], summary["fallback_reason"]
+    lines = [
+        f"estimator: {summary['estimator']}" + (f" (fell back: {fallback})" if fallback else ""),
+        f"{summary['frames']} frames, {summary['duration_s']:.1f} s, path {summary['path_length_m']:.4f} m",
+        f"scale: {scale['policy']} – {scale['reason']}",
+        f"motions: {summary['motions']['used']} used, {summary['motions']['rejected']} rejected",
+    ]
+    if "accuracy" in summary:
+        lines.append(verdict(summary["accuracy"]["motions"], summary["accuracy"]["refined"]))
+    return "\n".join(lines)
+
+
+def _compare(arguments: argparse.Namespace) -> int:
+    from fusion.compare import compare_paths, format_table
+
+    comparison = compare_paths(arguments.runs, arguments.truth)
+    if arguments.json:
+        _print_json(comparison.to_dict())
+    else:
+        print(format_table(comparison))
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

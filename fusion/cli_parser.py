@@ -1,0 +1,105 @@
+"""The command line's grammar: every command with its options and an example."""
+
+from __future__ import annotations
+
+import argparse
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import TypeAlias
+
+ORGANS = ("colon", "small-bowel", "stomach")
+VIBRATIONS = ("none", "gaussian", "peristalsis", "collision")
+
+
+def build_parser() -> argparse.ArgumentParser:
+    """The parser of `capsule-vio`; wrong usage exits with 2."""
+    parser = argparse.ArgumentParser(
+        prog="capsule-vio",
+        description="Where was the capsule? Visual-inertial odometry for wireless capsule endoscopy. Research use only.",
+    )
+    parser.add_argument("--version", action="version", version=f"%(prog)s {_version()}")
+    commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
+    for add in (_demo, _doctor, _simulate, _inspect, _predict, _refine, _compare):
+        add(commands)
+    return parser
+
+
+def _version() -> str:
+    try:
+        return version("capsule-vio")
+    except PackageNotFoundError:
+        return "(not installed)"
+
+
+Commands: TypeAlias = "argparse._SubParsersAction[argparse.ArgumentParser]"
+
+
+def _command(commands: Commands, name: str, help_text: str, example: str) -> argparse.ArgumentParser:
+    return commands.add_parser(name, help=help_text, description=help_text, epilog=f"example: capsule-vio {example}")
+
+
+def _json(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--json", action="store_true", help="print machine-readable results on stdout and nothing else there")
+
+
+def _demo(commands: Commands) -> None:
+    parser = _command(commands, "demo", "simulate an examination, refine it, and compare with the truth",
+                      "demo --out out/demo")
+    parser.add_argument("--out", type=Path, default=Path("out/demo"), metavar="DIR")
+    parser.add_argument("--seed", type=int, default=7)
+    _json(parser)
+
+
+def _doctor(commands: Commands) -> None:
+    _json(_command(commands, "doctor", "check the installation", "doctor"))
+
+
+def _simulate(commands: Commands) -> None:
+    parser = _command(commands, "simulate", "write a simulated recording with exact truth",
+                      "simulate --organ colon --vibration collision --level 3 --duration 60 --seed 1 --no-images --out REC")
+    parser.add_argument("--organ", choices=ORGANS, default="small-bowel")
+    parser.add_argument("--vibration", choices=VIBRATIONS, default="none")
+    parser.add_argument("--level", type=int, default=0, help="vibration level, 0 to 5")
+    parser.add_argument("--duration", type=float, default=60.0, metavar="S", help="seconds")
+    parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--no-images", action="store_true", help="times, IMU and truth only")
+    parser.add_argument("--motions", type=Path, metavar="FILE", help="also write motions as a network would report them")
+    parser.add_argument("--out", type=Path, required=True, metavar="REC")
+
+
+def _inspect(commands: Commands) -> None:
+    parser = _command(commands, "inspect", "say what a recording holds and whether it can be used", "inspect REC")
+    parser.add_argument("recording", type=Path, metavar="REC")
+    _json(parser)
+
+
+def _predict(commands: Commands) -> None:
+    parser = _command(commands, "predict", "measure relative motions on a recording's images",
+                      "predict REC --method classical --out motions.npz")
+    parser.add_argument("recording", type=Path, metavar="REC")
+    parser.add_argument("--method", choices=("learned", "classical"), default="learned",
+                        help="a trained network, or KLT tracks with essential matrix and PnP")
+    parser.add_argument("--weights", type=Path, metavar="W")
+    parser.add_argument("--depth", type=Path, metavar="DIR", help="also write the predicted depth maps")
+    parser.add_argument("--out", type=Path, required=True, metavar="motions.npz")
+
+
+def _refine(commands: Commands) -> None:
+    parser = _command(commands, "refine", "fuse motions and IMU into one trajectory with covariance",
+                      "refine REC --motions motions.npz --out RUN")
+    parser.add_argument("recording", type=Path, metavar="REC")
+    source = parser.add_mutually_exclusive_group()
+    source.add_argument("--motions", type=Path, metavar="motions.npz", help="motions from any source")
+    source.add_argument("--weights", type=Path, metavar="W", help="predict the motions with these weights")
+    parser.add_argument("--estimator", choices=("auto", "graph", "ekf"), help="default: the configuration's, auto")
+    parser.add_argument("--config", type=Path, metavar="c.yaml")
+    parser.add_argument("--out", type=Path, required=True, metavar="RUN")
+    _json(parser)
+
+
+def _compare(commands: Commands) -> None:
+    parser = _command(commands, "compare", "runs and trajectories side by side under every alignment",
+                      "compare RUN other.tum --truth truth.tum")
+    parser.add_argument("runs", type=Path, nargs="+", metavar="RUN", help="run folder or TUM file")
+    parser.add_argument("--truth", type=Path, metavar="traj.tum", help="default: the truth a run folder holds")
+    _json(parser)

@@ -1,0 +1,133 @@
+"""What a recording holds, and whether it can be refined: facts, verdicts, and what to do."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+
+from vio.errors import VioError
+from vio.imu import find_gaps
+from vio.imu_checks import ImuReport, check_imu
+from vio.recording import Recording, check_refinable
+
+Level = Literal["ok", "warning", "error"]
+
+JITTER_LIMIT = 0.2
+"""Spread of the frame intervals over their median above which the frame rate counts as irregular."""
+
+
+@dataclass(frozen=True)
+class Check:
+    """One verdict."""
+
+    name: str
+    level: Level
+    text: str
+
+
+@dataclass(frozen=True)
+class Inspection:
+    """Facts about a recording and one verdict per check."""
+
+    facts: dict[str, Any]
+    checks: tuple[Check, ...]
+
+    @property
+    def usable(self) -> bool:
+        """Whether no check ended in an error."""
+        return all(check.level != "error" for check in self.checks)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain values for `--json`."""
+        checks = [{"name": c.name, "level": c.level, "text": c.text} for c in self.checks]
+        return {"usable": self.usable, "facts": self.facts, "checks": checks}
+
+
+def inspect_recording(recording: Recording) -> Inspection:
+    """Look at everything but the pixels; never raises for what it finds, it says so."""
+    checks = [_frames(recording), _images(recording), *_imu(recording), _refinable(recording), _truth(recording)]
+    return Inspection(_facts(recording), tuple(checks))
+
+
+def _facts(recording: Recording) -> dict[str, Any]:
+    imu, camera = recording.imu, recording.calibration.camera
+    frame_dt = np.diff(recording.frame_t_s)
+    imu_dt = np.diff(imu.t_ns) * 1e-9
+    positive = imu_dt[imu_dt > 0]
+    return {
+        "name": recording.name,
+        "frames": len(recording),
+        "duration_s": recording.duration_s,
+        "frame_rate_hz": float(1 / np.median(frame_dt)) if len(frame_dt) else None,
+        "longest_frame_interval_s": float(frame_dt.max()) if len(frame_dt) else None,
+        "camera": None if camera is None else {"model": camera.model, "width": camera.width, "height": camera.height},
+        "lever_arm_m": float(np.linalg.norm(recording.calibration.T_body_camera[:3, 3])),
+        "time_offset_s": recording.calibration.time_offset_s,
+        "imu_samples": len(imu),
+        "imu_rate_hz": float(1 / np.median(positive)) if len(positive) else None,
+        "imu_gaps": [{"start_s": g.start_s, "end_s": g.end_s} for g in find_gaps(recording.imu_t_s)],
+        "has_images": recording.has_images,
+        "has_depth": recording.has_depth,
+        "has_truth": recording.truth is not None,
+        "provenance": recording.provenance,
+    }
+
+
+def _frames(recording: Recording) -> Check:
+    if len(recording) < 3:
+        return Check("frames", "warning", f"{len(recording)} frames; a trajectory needs more")
+    dt = np.diff(recording.frame_t_s)
+    spread = float(np.percentile(dt, 95) - np.percentile(dt, 5)) / float(np.median(dt))
+    text = f"{len(recording)} frames over {recording.duration_s:.1f} s, median interval {1e3 * np.median(dt):.1f} ms"
+    if spread > JITTER_LIMIT:
+        return Check("frames", "ok", f"{text}, irregular (5-95 % spread {100 * spread:.0f} %): stamps are used as they are")
+    return Check("frames", "ok", text)
+
+
+def _images(recording: Recording) -> Check:
+    listed = [path for path in recording.frame_paths if path is not None]
+    there = sum(path.is_file() for path in listed)
+    if there == len(recording):
+        return Check("images", "ok", f"all {there} image files exist")
+    if there == 0:
+        return Check("images", "warning", "no image files: refinement with given motions works, prediction does not")
+    return Check("images", "warning", f"{there} of {len(recording)} image files exist; restore the rest before prediction")
+
+
+def _imu(recording: Recording) -> list[Check]:
+    try:
+        report = check_imu(recording.imu, recording.calibration.imu_noise)
+    except VioError as error:
+        return [Check("imu", "error", str(error))]
+    checks = [Check("imu", "ok", _imu_text(report))]
+    return checks + [Check("imu", "warning", text) for text in report.warnings]
+
+
+def _imu_text(report: ImuReport) -> str:
+    return f"{report.rate_hz:.1f} Hz, median |specific force| {report.gravity_m_s2:.2f} m/s², {len(report.gaps)} gaps over 0.5 s"
+
+
+def _refinable(recording: Recording) -> Check:
+    try:
+        check_refinable(recording)
+    except VioError as error:
+        return Check("coverage", "error", str(error))
+    return Check("coverage", "ok", "the IMU covers all frames")
+
+
+def _truth(recording: Recording) -> Check:
+    if recording.truth is None:
+        return Check("truth", "ok", "none: accuracy will not be reported")
+    span = f"{recording.truth.t_s[0]:.1f} to {recording.truth.t_s[-1]:.1f} s"
+    return Check("truth", "ok", f"{len(recording.truth)} poses from {span}, path {recording.truth.path_length_m:.3f} m")
+
+
+def format_inspection(inspection: Inspection) -> str:
+    """The inspection as lines for a terminal."""
+    marks = {"ok": "ok     ", "warning": "WARNING", "error": "ERROR  "}
+    width = max(len(check.name) for check in inspection.checks)
+    lines = [f"{marks[c.level]}  {c.name.ljust(width)}  {c.text}" for c in inspection.checks]
+    verdict = "usable" if inspection.usable else "cannot be refined as it is"
+    return "\n".join([f"recording {inspection.facts['name']}: {verdict}", *lines])
