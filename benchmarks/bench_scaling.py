@@ -35,6 +35,7 @@ def measure(frames: int, seed: int) -> dict[str, float]:
 
 
 def main() -> None:
+    """Measure in fresh processes and record the ratios."""
     if len(sys.argv) == 3:
         print(json.dumps(measure(int(sys.argv[1]), int(sys.argv[2]))))
         return
@@ -43,14 +44,13 @@ def main() -> None:
     runs = []
     for frames in FRAMES:
         for seed in (401, 402, 403):
-            output = subprocess.run([sys.executable, __file__, str(frames), str(seed)], check=True, capture_output=True,
-                                    text=True).stdout
-            runs.append(json.loads(output))
-    rows = [[f"{r['frames']}", f"{r['cpu_s']:.1f}", f"{1e3 * r['cpu_s'] / r['frames']:.2f}", f"{r['bytes'] / 2**20:.0f}",
-             f"{r['bytes'] / r['frames'] / 1024:.1f}", f"{r['ate_mm']:.1f}", f"{r['ate_mm'] / 10 / r['path_m']:.2f}"]
-            for r in runs]
-    per_frame = {frames: [sum(r[k] / r["frames"] for r in runs if r["frames"] == frames) / 3 for k in ("cpu_s", "bytes")]
-                 for frames in FRAMES}
+            command = [sys.executable, __file__, str(frames), str(seed)]
+            runs.append(json.loads(subprocess.run(command, check=True, capture_output=True, text=True).stdout))
+    rows = [[f"{r['frames']}", f"{r['cpu_s']:.1f}", f"{1e3 * r['cpu_s'] / r['frames']:.2f}",
+             f"{r['bytes'] / 2**20:.0f}", f"{r['bytes'] / r['frames'] / 1024:.1f}", f"{r['ate_mm']:.1f}",
+             f"{r['ate_mm'] / 10 / r['path_m']:.2f}"] for r in runs]
+    per_frame = {frames: [sum(r[key] for r in runs if r["frames"] == frames) / (3 * frames)
+                          for key in ("cpu_s", "bytes")] for frames in FRAMES}
     ratios = [b / a for a, b in zip(per_frame[FRAMES[0]], per_frame[FRAMES[1]], strict=True)]
     body = (table(["frames", "CPU s", "ms/frame", "MiB above the start", "KiB/frame", "ATE SE3 mm", "% of path"], rows)
             + f"\n\nPer frame, {FRAMES[1]} over {FRAMES[0]} frames, means of three seeds: time × {ratios[0]:.2f}, "

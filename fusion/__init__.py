@@ -4,7 +4,7 @@
     refined = fusion.refine(recording, motions)
 """
 
-from fusion.compare import Comparison, compare, compare_paths
+from fusion.compare import Comparison, compare, compare_paths, format_table
 from fusion.config import RefineConfig, config_from_dict, load_config
 from fusion.refine import refine
 from fusion.result import ImuConclusion, Refinement, ScaleConclusion
@@ -13,5 +13,5 @@ from fusion.summary import summarize
 
 __all__ = [
     "Comparison", "ImuConclusion", "Provenance", "RefineConfig", "Refinement", "Run", "ScaleConclusion", "compare",
-    "compare_paths", "config_from_dict", "load_config", "read_run", "refine", "summarize", "write_run",
+    "compare_paths", "config_from_dict", "format_table", "load_config", "read_run", "refine", "summarize", "write_run",
 ]

@@ -11,7 +11,6 @@ import json
 import sys
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 from fusion.cli_parser import build_parser
@@ -73,7 +72,8 @@ def _simulate(arguments: argparse.Namespace) -> int:
 
     if not arguments.no_images:
         raise UsageError("rendered images are not part of this version; add --no-images for times, IMU and truth")
-    recording = simulate_recording(arguments.organ, arguments.vibration, arguments.level, arguments.duration, arguments.seed)
+    recording = simulate_recording(arguments.organ, arguments.vibration, arguments.level, arguments.duration,
+                                   arguments.seed)
     write_asl(recording, arguments.out)
     if arguments.motions is not None:
         truth, T_body_camera = recording.truth_at_frames(), recording.calibration.T_body_camera
@@ -138,7 +138,7 @@ def _refine(arguments: argparse.Namespace) -> int:
         motions = learned.predict(recording, arguments.weights)
     refined = refine(recording, motions, config, _announce)
     command = ["refine", arguments.recording.name, "--out", arguments.out.name]
-    summary = write_run(refined, arguments.out, Provenance(command, config, inputs))
+    summary = write_run(refined, arguments.out, Provenance(command, config, inputs), motions)
     if arguments.json:
         _print_json(summary)
     else:

@@ -15,7 +15,7 @@ def build_parser() -> argparse.ArgumentParser:
     """The parser of `capsule-vio`; wrong usage exits with 2."""
     parser = argparse.ArgumentParser(
         prog="capsule-vio",
-        description="Where was the capsule? Visual-inertial odometry for wireless capsule endoscopy. Research use only.",
+        description="Visual-inertial odometry for wireless capsule endoscopy. Research use only.",
     )
     parser.add_argument("--version", action="version", version=f"%(prog)s {_version()}")
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
@@ -39,7 +39,7 @@ def _command(commands: Commands, name: str, help_text: str, example: str) -> arg
 
 
 def _json(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--json", action="store_true", help="print machine-readable results on stdout and nothing else there")
+    parser.add_argument("--json", action="store_true", help="machine-readable results on stdout, nothing else there")
 
 
 def _demo(commands: Commands) -> None:
@@ -56,14 +56,14 @@ def _doctor(commands: Commands) -> None:
 
 def _simulate(commands: Commands) -> None:
     parser = _command(commands, "simulate", "write a simulated recording with exact truth",
-                      "simulate --organ colon --vibration collision --level 3 --duration 60 --seed 1 --no-images --out REC")
+                      "simulate --organ colon --vibration collision --level 3 --duration 60 --no-images --out REC")
     parser.add_argument("--organ", choices=ORGANS, default="small-bowel")
     parser.add_argument("--vibration", choices=VIBRATIONS, default="none")
     parser.add_argument("--level", type=int, default=0, help="vibration level, 0 to 5")
     parser.add_argument("--duration", type=float, default=60.0, metavar="S", help="seconds")
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--no-images", action="store_true", help="times, IMU and truth only")
-    parser.add_argument("--motions", type=Path, metavar="FILE", help="also write motions as a network would report them")
+    parser.add_argument("--motions", type=Path, metavar="FILE", help="also write motions as a network would report")
     parser.add_argument("--out", type=Path, required=True, metavar="REC")
 
 

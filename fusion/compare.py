@@ -99,7 +99,7 @@ def compare_paths(paths: list[Path], truth_path: Path | None) -> Comparison:
         estimates |= dict(zip(names, (run.motions_only, run.refined), strict=True))
         pairs.append(names)
     if truth is None:
-        raise TrajectoryError("compare: no truth; give --truth traj.tum (runs of recordings with truth bring their own)")
+        raise TrajectoryError("compare: no truth; give --truth traj.tum (runs of recordings with truth bring it)")
     return compare(estimates, truth, pairs)
 
 

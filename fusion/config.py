@@ -77,7 +77,8 @@ def config_from_dict(values: dict[str, Any]) -> RefineConfig:
     Raises:
         ConfigError: an unknown key (the known ones are listed), a wrong type or a number outside its range.
     """
-    return _build(RefineConfig, values, "")
+    config: RefineConfig = _build(RefineConfig, values, "")
+    return config
 
 
 def load_config(path: str | Path) -> RefineConfig:
@@ -137,4 +138,4 @@ def _positive(name: str, value: Any, kind: type) -> int | float:
         raise ConfigError(f"configuration: {name} is {value!r}; must be a positive number")
     if kind is int and int(value) != value:
         raise ConfigError(f"configuration: {name} is {value!r}; must be a whole number")
-    return kind(value)
+    return int(value) if kind is int else float(value)

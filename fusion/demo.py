@@ -47,6 +47,6 @@ def run_demo(out: Path, seed: int, announce: Callable[[str], None] | None = None
         say(f"refining with the {estimator}")
         config = replace(RefineConfig(), estimator=estimator)
         provenance = Provenance(["demo", "--seed", str(seed)], config, {"motions": out / "motions.npz"}, seed)
-        write_run(refine(recording, motions, config), out / estimator, provenance)
+        write_run(refine(recording, motions, config), out / estimator, provenance, motions)
     comparison = compare_paths([out / "graph", out / "ekf"], None)
     return Demo(comparison, out / "graph" / "report.html", out / "graph" / "trajectory.svg")

@@ -52,8 +52,8 @@ def _works(estimator: Any) -> Finding:
         refined = refine(recording, network.motions, RefineConfig(estimator=estimator))
     except VioError as error:
         return Finding(estimator, False, str(error))
-    finite = bool(np.isfinite(refined.trajectory.T_world_body).all())
-    return Finding(estimator, finite and refined.estimator == estimator, f"{len(refined.trajectory)} simulated frames refined")
+    ok = refined.estimator == estimator and bool(np.isfinite(refined.trajectory.T_world_body).all())
+    return Finding(estimator, ok, f"{len(refined.trajectory)} simulated frames refined")
 
 
 def format_findings(findings: list[Finding]) -> str:

@@ -69,7 +69,8 @@ class _CapsuleEkf:
         pieces, noise = self.problem.pieces, self.problem.noise
         accel_density = noise.accel_density_m_s2_rthz * self.problem.accel_inflation[k]
         gyro_density = noise.gyro_density_rad_s_rthz * self.problem.gyro_inflation[k]
-        rates = np.repeat([gyro_density, accel_density, 0.0, noise.gyro_walk_rad_s2_rthz, noise.accel_walk_m_s3_rthz], 3)
+        walks = noise.gyro_walk_rad_s2_rthz, noise.accel_walk_m_s3_rthz
+        rates = np.repeat([gyro_density, accel_density, 0.0, *walks], 3)
         Phi, Q = np.eye(15), np.zeros((15, 15))
         for n in range(pieces.first[k], pieces.first[k + 1]):
             dt = pieces.dt_s[n]
@@ -173,7 +174,8 @@ def ekf_estimate(problem: Problem, R_world_body_first: Array, initial: InitialCo
     if not np.isfinite(T).all():
         raise EstimationError("ekf: the trajectory is not finite")
     mean, sd = problem.scale_log_mean, problem.scale_log_sd
-    conclusion = ScaleConclusion("fixed", mean, sd, "the filter holds scale at its prior: a filter's free scale is biased")
+    reason = "the filter holds scale at its prior: a filter's free scale is biased"
+    conclusion = ScaleConclusion("fixed", mean, sd, reason)
     return Estimate(T, add_scale_uncertainty(T, cov, sd), v, gyro_bias, accel_bias, np.full(m, mean), np.full(m, sd),
                     conclusion, np.array(outliers, np.int64))
 

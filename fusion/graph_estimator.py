@@ -110,7 +110,8 @@ class GraphEstimator:
             if objection is None or policy == "free":
                 conclusion = scale_policy.conclude_free(free, self.problem)
                 if policy == "free":
-                    conclusion = replace(conclusion, policy="free", reason=f"asked for; {objection or conclusion.reason}")
+                    reason = f"asked for; {objection or conclusion.reason}"
+                    conclusion = replace(conclusion, policy="free", reason=reason)
                 return final, conclusion, 1.0
         for inflation in scale_policy.INFLATION_LADDER:
             with self.stages("accelerometer_down_weighted"):
@@ -120,9 +121,10 @@ class GraphEstimator:
                 final, free = self._free_pass(weak_start, weak, start_scale)
                 if scale_policy.reasons_against(free, self.problem, self.config.scale) is None:
                     reason = f"scale from the prior, accelerometer noise × {inflation:g}: {objection or 'asked for'}"
-                    conclusion = replace(scale_policy.conclude_free(free, self.problem), policy="prior", reason=reason)
+                    conclusion = scale_policy.conclude_free(free, self.problem)
+                    conclusion = replace(conclusion, policy="prior", reason=reason)
                     return final, conclusion, inflation
-        reason = f"scale held at its prior, accelerometer noise × {inflation:g}: {objection or 'asked for a prior only'}"
+        reason = f"scale held at its prior, accelerometer noise × {inflation:g}: {objection or 'asked for a prior'}"
         return self._held(weak, start_scale, reason), self._held_conclusion(start_scale, reason), inflation
 
     def _held_conclusion(self, log_scale: float, reason: str) -> ScaleConclusion:

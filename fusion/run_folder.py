@@ -18,6 +18,7 @@ from fusion.summary import summarize
 from vio.atomic import atomic_folder
 from vio.errors import FormatError
 from vio.formats.tum import read_tum, write_tum
+from vio.motions import RelativeMotions
 from vio.trajectory import Trajectory
 
 MARKER = "manifest.json"
@@ -46,8 +47,15 @@ class Run:
     summary: dict[str, Any]
 
 
-def write_run(refinement: Refinement, out: str | Path, provenance: Provenance) -> dict[str, Any]:
+def write_run(refinement: Refinement, out: str | Path, provenance: Provenance,
+              motions: RelativeMotions | None = None) -> dict[str, Any]:
     """Write the run folder of the contract atomically and return its summary.
+
+    Args:
+        refinement: what was concluded.
+        out: the folder; an earlier run folder is replaced, anything else is refused.
+        provenance: what goes into the manifest.
+        motions: the motions it was made from; the report marks the rejected ones with their help.
 
     Raises:
         OutputError: `out` exists and is no run folder, or cannot be written.
@@ -63,8 +71,8 @@ def write_run(refinement: Refinement, out: str | Path, provenance: Provenance) -
             write_tum(refinement.truth, folder / "truth.tum")
         _write_states(refinement, folder / "trajectory.npz")
         _write_json(summary, folder / "summary.json")
-        write_trajectory_plot(refinement, folder / "trajectory.svg")
-        write_report(refinement, summary, folder / "report.html")
+        write_trajectory_plot(refinement, folder / "trajectory.svg", motions)
+        write_report(refinement, summary, folder / "report.html", motions)
         _write_json(manifest, folder / MARKER)
     return summary
 

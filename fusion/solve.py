@@ -60,13 +60,13 @@ class MotionTerm:
 
     def cost(self, values: gtsam.Values) -> float:
         """Robust cost at the given values."""
-        r = residuals(self.motions, *read_poses(values), self.log_scale(values))
-        return self.losses(np.einsum("nk,nk->n", r, r))[0]
+        return self.losses(self.squared_norm(values))[0]
 
     def squared_norm(self, values: gtsam.Values) -> Array:
         """(N,) whitened residuals squared, unweighted."""
         r = residuals(self.motions, *read_poses(values), self.log_scale(values))
-        return np.einsum("nk,nk->n", r, r)
+        squared: Array = np.einsum("nk,nk->n", r, r)
+        return squared
 
 
 @dataclass(frozen=True)
@@ -81,7 +81,8 @@ class Solution:
     iterations: int
 
 
-def linear_graph(native: gtsam.NonlinearFactorGraph, values: gtsam.Values, term: MotionTerm) -> gtsam.GaussianFactorGraph:
+def linear_graph(native: gtsam.NonlinearFactorGraph, values: gtsam.Values,
+                 term: MotionTerm) -> gtsam.GaussianFactorGraph:
     """All factors linearised at `values`."""
     gaussian = native.linearize(values)
     blocks = linearize(term.motions, *read_poses(values), term.log_scale(values))

@@ -17,10 +17,13 @@ FRAMES, SECONDS = 60, 20
 def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A simulated recording REC with motions.npz beside it, made by the command line itself."""
     folder = tmp_path_factory.mktemp("cli")
-    arguments = ["simulate", "--organ", "colon", "--vibration", "gaussian", "--level", "2", "--duration", str(SECONDS),
-                 "--seed", "5", "--no-images", "--out", str(folder / "REC"), "--motions", str(folder / "motions.npz")]
-    assert main(arguments) == 0
+    simulate(folder / "REC", folder / "motions.npz")
     return folder
+
+
+def simulate(rec: Path, motions: Path) -> None:
+    scenario = ["--organ", "colon", "--vibration", "gaussian", "--level", "2", "--duration", str(SECONDS)]
+    assert main(["simulate", *scenario, "--seed", "5", "--no-images", "--out", str(rec), "--motions", str(motions)]) == 0
 
 
 @pytest.fixture
@@ -52,7 +55,8 @@ def test_refine_writes_the_run_folder_and_compare_reads_it(made, tmp_path, capsy
     rows = json.loads(capsys.readouterr().out)["accuracy"]
     for name, key in (("RUN: refined", "refined"), ("RUN: motions only", "motions")):
         for mode in ("origin", "yaw4", "se3", "sim3"):
-            assert rows[name][mode]["ate_rmse_m"] == pytest.approx(summary["accuracy"][key][mode]["ate_rmse_m"], rel=1e-6)
+            expected = summary["accuracy"][key][mode]["ate_rmse_m"]
+            assert rows[name][mode]["ate_rmse_m"] == pytest.approx(expected, rel=1e-6)
 
 
 def test_two_runs_give_the_same_bytes(made, tmp_path):
@@ -83,9 +87,7 @@ def test_doctor_refines_with_both_estimators(capsys):
 
 
 def test_simulate_is_reproducible(made, tmp_path):
-    arguments = ["simulate", "--organ", "colon", "--vibration", "gaussian", "--level", "2", "--duration", str(SECONDS),
-                 "--seed", "5", "--no-images", "--out", str(tmp_path / "REC"), "--motions", str(tmp_path / "m.npz")]
-    assert main(arguments) == 0
+    simulate(tmp_path / "REC", tmp_path / "m.npz")
     for file in sorted(p for p in (made / "REC").rglob("*") if p.is_file()):
         assert file.read_bytes() == (tmp_path / "REC" / file.relative_to(made / "REC")).read_bytes(), file.name
     assert np.array_equal(load_motions(made / "motions.npz").T_i_j, load_motions(tmp_path / "m.npz").T_i_j)
@@ -194,7 +196,8 @@ def test_unusable_motions_exit_3(made, tmp_path, capsys):
     with np.load(made / "motions.npz") as data:
         arrays = dict(data)
     spoiled = {
-        "rotation": ("T_i_j", lambda T: T * 1.01), "finite": ("T_i_j", lambda T: np.where(T == T[3, 0, 3], np.nan, T)),
+        "rotation": ("T_i_j", lambda T: T * 1.01),
+        "finite": ("T_i_j", lambda T: np.where(T[3, 0, 3] == T, np.nan, T)),
         "positive definite": ("cov", lambda c: -c), "matches no frame": ("t_j", lambda t: t + 0.1),
     }
     for name, (key, change) in spoiled.items():
@@ -209,7 +212,8 @@ def test_unusable_motions_exit_3(made, tmp_path, capsys):
 
 def test_configuration_mistakes_exit_3(made, tmp_path, capsys):
     config = tmp_path / "c.yaml"
-    for text, word in (("robust: {gat: 3}", "robust.gat"), ("solver: {chunk_frames: -1}", "positive"), ("[1]", "mapping")):
+    mistakes = (("robust: {gat: 3}", "robust.gat"), ("solver: {chunk_frames: -1}", "positive"), ("[1]", "mapping"))
+    for text, word in mistakes:
         config.write_text(text)
         assert refine(made / "REC", made / "motions.npz", tmp_path / "RUN", "--config", str(config)) == 3
         assert word in one_line(capsys)

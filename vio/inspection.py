@@ -82,7 +82,7 @@ def _frames(recording: Recording) -> Check:
     spread = float(np.percentile(dt, 95) - np.percentile(dt, 5)) / float(np.median(dt))
     text = f"{len(recording)} frames over {recording.duration_s:.1f} s, median interval {1e3 * np.median(dt):.1f} ms"
     if spread > JITTER_LIMIT:
-        return Check("frames", "ok", f"{text}, irregular (5-95 % spread {100 * spread:.0f} %): stamps are used as they are")
+        return Check("frames", "ok", f"{text}, irregular (5-95 % spread {100 * spread:.0f} %), used as stamped")
     return Check("frames", "ok", text)
 
 
@@ -93,7 +93,7 @@ def _images(recording: Recording) -> Check:
         return Check("images", "ok", f"all {there} image files exist")
     if there == 0:
         return Check("images", "warning", "no image files: refinement with given motions works, prediction does not")
-    return Check("images", "warning", f"{there} of {len(recording)} image files exist; restore the rest before prediction")
+    return Check("images", "warning", f"{there} of {len(recording)} image files exist; prediction needs all")
 
 
 def _imu(recording: Recording) -> list[Check]:
@@ -106,7 +106,8 @@ def _imu(recording: Recording) -> list[Check]:
 
 
 def _imu_text(report: ImuReport) -> str:
-    return f"{report.rate_hz:.1f} Hz, median |specific force| {report.gravity_m_s2:.2f} m/s², {len(report.gaps)} gaps over 0.5 s"
+    force = f"median |specific force| {report.gravity_m_s2:.2f} m/s²"
+    return f"{report.rate_hz:.1f} Hz, {force}, {len(report.gaps)} gaps over 0.5 s"
 
 
 def _refinable(recording: Recording) -> Check:
