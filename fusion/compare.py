@@ -49,17 +49,15 @@ def compare(estimates: dict[str, Trajectory], truth: Trajectory, pairs: list[tup
     Raises:
         TrajectoryError: no frame is shared by all.
     """
-    matched = {name: associate(estimate, truth) for name, estimate in estimates.items()}
-    shared = None
-    for _, reference in matched.values():
-        shared = reference.t_s if shared is None else np.intersect1d(shared, reference.t_s)
-    if shared is None or len(shared) == 0:
+    # Truth first: all matches then carry the truth's times, which identify the frames.
+    matched = {name: associate(truth, estimate)[1] for name, estimate in estimates.items()}
+    shared = truth.t_s[np.all([np.isin(truth.t_s, estimate.t_s) for estimate in matched.values()], axis=0)]
+    if not matched or len(shared) == 0:
         raise TrajectoryError("compare: no frame is shared by all trajectories and the truth; check their clocks")
     reference = truth.select(np.isin(truth.t_s, shared))
     rows = {}
-    for name, (estimate, own_reference) in matched.items():
-        common = estimate.select(np.isin(own_reference.t_s, shared))
-        rows[name] = accuracy_table(common, reference)
+    for name, estimate in matched.items():
+        rows[name] = accuracy_table(estimate.select(np.isin(estimate.t_s, shared)), reference)
     verdicts = tuple(verdict(rows[only], rows[refined], only, refined) for only, refined in pairs)
     return Comparison(len(shared), len(truth), rows, verdicts)
 

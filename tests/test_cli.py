@@ -23,7 +23,8 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def simulate(rec: Path, motions: Path) -> None:
     scenario = ["--organ", "colon", "--vibration", "gaussian", "--level", "2", "--duration", str(SECONDS)]
-    assert main(["simulate", *scenario, "--seed", "5", "--no-images", "--out", str(rec), "--motions", str(motions)]) == 0
+    arguments = ["simulate", *scenario, "--seed", "5", "--no-images", "--out", str(rec), "--motions", str(motions)]
+    assert main(arguments) == 0
 
 
 @pytest.fixture

@@ -12,7 +12,7 @@ from scipy.linalg import expm
 from vio import open_recording, se3
 from vio.errors import ImuError
 from vio.imu import ImuNoise, ImuSamples, find_gaps, preintegrate_rotation, split_at_frames
-from vio.imu_checks import check_imu, gyro_in_degrees
+from vio.imu_checks import check_imu, find_saturation, gyro_in_degrees
 from vio.simulation.scenario import simulate_recording
 
 
@@ -200,6 +200,12 @@ def test_simulated_capsules_are_judged_rightly(vibration, level, mode):
             check_imu(in_degrees(recording.imu), noise)
 
 
+def test_forces_that_point_anywhere_decide_nothing():
+    samples = resting()
+    shaken = samples.accel_m_s2 + np.random.default_rng(1).normal(0, 20, (400, 3))
+    assert not gyro_in_degrees(replace(samples, gyro_rad_s=samples.gyro_rad_s + 0.5, accel_m_s2=shaken))
+
+
 def test_a_turn_about_gravity_alone_is_left_undecided():
     samples = resting()
     gyro = samples.gyro_rad_s + np.array([0.3, -0.2, 9.8]) / 9.81
@@ -274,6 +280,14 @@ def test_saturation_with_and_without_a_known_range():
 @pytest.mark.parametrize("step", [0.0, 1e-3, 0.02, 0.2])
 def test_a_resting_quantised_sensor_is_not_saturated(step):
     assert check_imu(resting(4000, step=step), ImuNoise(gyro_range_rad_s=34.9)).saturated == {}
+
+
+def test_a_slow_swing_that_dwells_at_its_ends_is_not_saturated():
+    samples = resting(4000)
+    swing = np.round(3 * np.sin(2 * np.pi * 0.02 * np.arange(4000) * 0.025), 1)
+    assert (swing == 3).sum() > 100
+    samples.gyro_rad_s[:, 0] = swing
+    assert find_saturation(samples, ImuNoise()) == {}
 
 
 def test_oddities_are_warnings():

@@ -32,7 +32,6 @@ from vio.simulation.imu_synthesis import ImuBiases, corrupt
 from vio.simulation.path import moving_path
 from vio.simulation.scenario import START_T_NS
 from vio.simulation.vibration import make_vibration
-from vio.trajectory import Trajectory
 
 SHAKING = [kind for kind in KINDS if kind != "none"]
 NOISELESS = {"noise": ImuNoise(1e-12, 1e-12, 1e-12, 1e-12), "accel_bias_sd_m_s2": 0.0, "gyro_bias_sd_rad_s": 0.0}
@@ -192,14 +191,13 @@ def integrate_intervals(simulation):
 
 @pytest.mark.parametrize("organ", ORGANS)
 def test_ideal_imu_reproduces_every_frame_interval(organ):
-    # Measured over 10 min per organ: 0.001-0.0015 deg and 0.006-0.009 mm RMS; the largest single errors
-    # (0.014 deg, 0.09 mm) belong to intervals within tumbles of up to 150 deg/s, cut inside a 25 ms sample.
+    # The largest single errors belong to intervals within tumbles of up to 150 deg/s.
     error = integrate_intervals(simulate(organ, "none", 0, 60.0, 3, **NOISELESS))
     rotation_deg, position_mm, velocity_mm_s = np.sqrt(np.mean(error**2, axis=0))
-    assert rotation_deg < 0.005
+    assert rotation_deg < 0.001
     assert position_mm < 0.02
     assert velocity_mm_s < 0.15
-    assert error[:, 0].max() < 0.02
+    assert error[:, 0].max() < 0.005
     assert error[:, 1].max() < 0.15
 
 
@@ -268,63 +266,6 @@ def test_capsule_stays_in_the_abdomen_and_tumbles(organ):
     assert np.rad2deg(turns.max()) > 15
 
 
-# ---- network-like motions --------------------------------------------------------------------
-
-def error_per_motion(truth, network):
-    """Right-perturbation error (N, 6) of the motions against truth, at the true scale."""
-    T = truth.T_world_body @ T_BODY_CAMERA
-    step = se3.inverse(T[:-1]) @ T[1:]
-    step[:, :3, 3] *= np.exp(-network.true_log_scale)[:, None]
-    return se3.log(se3.inverse(step) @ network.motions.T_i_j)
-
-
-@pytest.fixture(scope="module")
-def long_truth():
-    motion = motion_of("small-bowel", "none", 0, 4000.0, 1)
-    t = np.arange(12_000) / 3
-    return Trajectory(t, motion.evaluate(t).T_world_body)
-
-
-def test_network_errors_match_the_reported_covariance_except_for_outliers(long_truth):
-    network = network_like_motions(long_truth, T_BODY_CAMERA, 3)
-    error = error_per_motion(long_truth, network)
-    nees = np.einsum("ni,nij,nj->n", error, np.linalg.inv(network.motions.cov), error) / 6
-    good = ~network.is_outlier
-    assert nees[good].mean() == pytest.approx(np.exp(2 * 0.2**2), rel=0.03)  # 1.083: sigmas are off by 20 %
-    assert np.median(nees[network.is_outlier]) > 20
-    assert network.is_outlier.mean() == pytest.approx(0.02, abs=0.004)
-    per_axis = error[good] / np.sqrt(np.diagonal(network.motions.cov[good], axis1=1, axis2=2))
-    np.testing.assert_allclose(per_axis.std(axis=0), np.sqrt(np.exp(0.08)), rtol=0.05)
-    assert np.rad2deg(error[good, :3].std()) == pytest.approx(0.3 * np.exp(0.4**2), rel=0.05)
-    camera = long_truth.T_world_body @ T_BODY_CAMERA
-    step_m = np.linalg.norm(np.diff(camera[:, :3, 3], axis=0), axis=1)
-    relative = error[:, 3:] * np.exp(network.true_log_scale)[:, None] / (0.03 * step_m + 5e-5)[:, None]
-    assert relative[good].std() == pytest.approx(np.exp(0.4**2), rel=0.05)
-    perfect = network_like_motions(long_truth, T_BODY_CAMERA, 3, reported_sd=0.0, outliers=0.0)
-    error = error_per_motion(long_truth, perfect)
-    assert not perfect.is_outlier.any()
-    assert (error**2 / np.diagonal(perfect.motions.cov, axis1=1, axis2=2)).mean() == pytest.approx(1.0, rel=0.02)
-
-
-def test_network_scale_is_drawn_from_its_prior_and_walks(long_truth):
-    short = long_truth.select(np.arange(1001))
-    runs = [network_like_motions(short, T_BODY_CAMERA, seed) for seed in range(150)]
-    first, last = (np.array([run.true_log_scale[k] for run in runs]) for k in (0, -1))
-    assert first.mean() == pytest.approx(np.log(0.8), abs=0.02)
-    assert first.std() == pytest.approx(0.10, rel=0.17)
-    assert (last - first).std() == pytest.approx(0.10, rel=0.17)
-    assert (runs[0].motions.scale_log_mean, runs[0].motions.scale_log_sd) == (pytest.approx(np.log(0.8)), 0.10)
-
-
-def test_network_outliers_can_come_in_bursts(long_truth):
-    masks = [network_like_motions(long_truth, T_BODY_CAMERA, seed, outliers=0.05, burst_length=8).is_outlier
-             for seed in range(20)]
-    # about 75 bursts in one run: its share has a standard deviation of 0.006, the mean of 20 runs one of 0.0013
-    assert np.mean(masks) == pytest.approx(0.05, abs=0.004)
-    runs = np.diff(np.flatnonzero(np.diff(np.concatenate([[False], masks[0], [False]]).astype(int))))[::2]
-    assert np.median(runs) == 8
-
-
 # ---- bad input -------------------------------------------------------------------------------
 
 @pytest.mark.parametrize(("changes", "words"), [
@@ -351,10 +292,3 @@ def test_the_impossible_is_refused_in_one_line(changes, words):
         simulate_recording(**arguments)
     assert caught.value.exit_code == 3
     assert "\n" not in str(caught.value)
-
-
-@pytest.mark.parametrize("changes", [{"outliers": 1.0}, {"burst_length": 0}, {"reported_sd": -0.1},
-                                     {"rotation_sd_rad": 0.0}, {"translation_rel": float("nan")}])
-def test_impossible_network_noise_is_refused(long_truth, changes):
-    with pytest.raises(SimulationError, match=next(iter(changes))):
-        network_like_motions(long_truth, T_BODY_CAMERA, 0, **changes)
