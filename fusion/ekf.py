@@ -30,6 +30,8 @@ ROT, VEL, POS, BG, BA, CLONE_ROT, CLONE_POS = (slice(i, i + 3) for i in range(0,
 CHI2_6_99, CHI2_6_999 = 16.8, 22.5
 GAP_VELOCITY_SD_M_S_RTS, GAP_RATE_SD_RAD_RTS = 0.05, 1.0
 """Random walks of velocity and attitude where the IMU is missing."""
+LOST_SHARE = 0.5
+"""Share of motions that may look like outliers; beyond it the filter follows the IMU alone, wherever that leads."""
 GRAVITY_WORLD = np.array([0.0, 0.0, -GRAVITY_M_S2])
 EYE3 = np.eye(3)
 
@@ -157,7 +159,7 @@ def ekf_estimate(problem: Problem, R_world_body_first: Array, initial: InitialCo
         initial: standard deviations of the first state.
 
     Raises:
-        EstimationError: the state stopped being finite.
+        EstimationError: the state stopped being finite, or most motions looked like outliers.
     """
     ekf = _CapsuleEkf(problem, R_world_body_first, initial)
     m = len(problem)
@@ -173,6 +175,10 @@ def ekf_estimate(problem: Problem, R_world_body_first: Array, initial: InitialCo
         cov[k], gyro_bias[k], accel_bias[k] = ekf.pose_cov(), ekf.gyro_bias, ekf.accel_bias
     if not np.isfinite(T).all():
         raise EstimationError("ekf: the trajectory is not finite")
+    updates = int((motion_of >= 0).sum())
+    if len(outliers) > LOST_SHARE * updates:
+        raise EstimationError(f"ekf: {len(outliers)} of {updates} motions looked like outliers (limit "
+                              f"{100 * LOST_SHARE:.0f} %): the IMU disagrees with them and the filter lost track")
     mean, sd = problem.scale_log_mean, problem.scale_log_sd
     reason = "the filter holds scale at its prior: a filter's free scale is biased"
     conclusion = ScaleConclusion("fixed", mean, sd, reason)

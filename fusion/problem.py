@@ -11,12 +11,14 @@ from fusion.scaled_motion import ScaledMotions, make_motions
 from fusion.vibration import vibration_inflation
 from vio import se3
 from vio.imu import Gap, ImuNoise, ImuPieces, find_gaps, preintegrate_rotation, split_at_frames
-from vio.imu_checks import check_imu
+from vio.imu_checks import check_imu, saturated_samples
 from vio.motions import RelativeMotions, match_frames
 from vio.recording import Recording, check_refinable
 
 Array = NDArray[np.float64]
 
+SATURATION_INFLATION = 50.0
+"""Factor on a sensor's density in intervals where one of its axes sits at full scale."""
 HOLE_RATIO = 1.5
 """Sample spacing over the nominal one above which an interval's noise is inflated."""
 BIAS_FRAMES = 3000
@@ -73,10 +75,12 @@ def build_problem(recording: Recording, motions: RelativeMotions) -> Problem:
     usable = _usable(t, gaps)
     noise = recording.calibration.imu_noise
     holes = _hole_inflation(pieces, imu_t)
+    clipped = _saturation_inflation(recording, t)
     accel_inflation, gyro_inflation = vibration_inflation(recording.imu, imu_t, t, noise)
     return Problem(
         name=recording.name, t_s=t, pieces=pieces, imu_usable=usable, gaps=gaps,
-        accel_inflation=holes * accel_inflation, gyro_inflation=holes * gyro_inflation, motions=batch,
+        accel_inflation=holes * clipped[1] * accel_inflation, gyro_inflation=holes * clipped[0] * gyro_inflation,
+        motions=batch,
         scale_log_mean=motions.scale_log_mean, scale_log_sd=motions.scale_log_sd, noise=noise,
         gyro_bias_rad_s=_initial_gyro_bias(pieces, batch, np.diff(t), usable),
     )
@@ -92,6 +96,18 @@ def _usable(t: Array, gaps: tuple[Gap, ...]) -> NDArray[np.bool_]:
 def _hole_inflation(pieces: ImuPieces, imu_t_s: Array) -> Array:
     ratio = pieces.longest_s / np.median(np.diff(imu_t_s))
     return np.where(ratio > HOLE_RATIO, ratio, 1.0)
+
+
+def _saturation_inflation(recording: Recording, t: Array) -> tuple[Array, Array]:
+    """(M-1,) factors for gyro and accelerometer: large where one of their axes sits at full scale."""
+    mask = saturated_samples(recording.imu, recording.calibration.imu_noise)
+    edges = np.searchsorted(recording.imu_t_s, t)
+    factors = []
+    for sensor in (mask[:, :3].any(axis=1), mask[:, 3:].any(axis=1)):
+        total = np.concatenate([[0], np.cumsum(sensor)])
+        hit = np.diff(total[edges]) > 0
+        factors.append(np.where(hit, SATURATION_INFLATION, 1.0))
+    return factors[0], factors[1]
 
 
 def _initial_gyro_bias(pieces: ImuPieces, motions: ScaledMotions, dt: Array, usable: NDArray[np.bool_]) -> Array:

@@ -158,6 +158,11 @@ def spoil_gravity(rec: Path) -> None:
     spoil_values(rec, lambda v: np.r_[v[:3], 0.01 * v[3:]])
 
 
+def spoil_saturated(rec: Path) -> None:
+    counter = iter(range(10**9))
+    spoil_values(rec, lambda v: np.r_[v[:4], 39.2266, v[5:]] if next(counter) % 5 == 0 else v)
+
+
 def spoil_coverage(rec: Path) -> None:
     path, rows = imu_rows(rec)
     path.write_text("\n".join(rows[:300]))
@@ -180,7 +185,8 @@ def spoil_no_frames(rec: Path) -> None:
 
 FAULTS = [
     (spoil_nan, "finite"), (spoil_order, "sort"), (spoil_duplicate, "duplicate"), (spoil_g, "g"), (spoil_deg, "deg/s"),
-    (spoil_gravity, "gravity"), (spoil_coverage, "cover"), (spoil_calibration, "gyroscope_noise_density"),
+    (spoil_gravity, "gravity"), (spoil_saturated, "full scale"),
+    (spoil_coverage, "cover"), (spoil_calibration, "gyroscope_noise_density"),
     (spoil_one_frame, "2"), (spoil_no_frames, "frame"),
 ]
 

@@ -29,6 +29,8 @@ UNIT_RATIO = 3.0
 
 SMALLEST_FULL_SCALE = (2.0, 17.5)  # rad/s, m/s²: just below the 125 deg/s and 2 g of common sensors
 SATURATED_RUN = 3
+SATURATED_SHARE = 0.05
+"""Of an axis's samples at full scale; above it the signal is lost, below it only those moments are."""
 OUTLIER_SPREADS = 5.0
 RATE_TOLERANCE = 0.2
 
@@ -54,7 +56,8 @@ def check_imu(samples: ImuSamples, noise: ImuNoise) -> ImuReport:
 
     Raises:
         ImuError: fewer than two samples, wrong shapes, a value that is not finite, stamps that do not increase, no
-            gravity in the accelerometer (or in other units), a gyro in deg/s; each with row, time, limit and remedy.
+            gravity in the accelerometer (or in other units), a gyro in deg/s, an axis at full scale for more than
+            5 % of the samples; each with row, time, limit and remedy.
     """
     t_s = _check_stamps(samples)
     _check_finite(samples, t_s)
@@ -63,27 +66,40 @@ def check_imu(samples: ImuSamples, noise: ImuNoise) -> ImuReport:
     rate_hz = 1.0 / float(np.median(np.diff(t_s)))
     gaps = tuple(find_gaps(t_s))
     saturated = find_saturation(samples, noise)
+    _check_saturation(saturated, len(samples))
     return ImuReport(rate_hz, gaps, gravity_m_s2, saturated, _warnings(samples, noise, rate_hz, gaps, saturated))
 
 
-def find_saturation(samples: ImuSamples, noise: ImuNoise) -> dict[str, int]:
-    """How many samples of each axis sit at full scale.
+def saturated_samples(samples: ImuSamples, noise: ImuNoise) -> NDArray[np.bool_]:
+    """Which samples sit at full scale: (N, 6), gyro axes first.
 
     With a known range: those within 0.1 % of it. Without: runs of three or more equal samples at the axis's
     extreme, if that is as large as a full scale can be and stands out from the rest of the axis.
     """
     values = np.hstack([samples.gyro_rad_s, samples.accel_m_s2])
-    found = {}
-    for k, name in enumerate(AXES):
+    mask = np.zeros(values.shape, bool)
+    for k in range(len(AXES)):
         full_scale = noise.gyro_range_rad_s if k < 3 else noise.accel_range_m_s2
         axis = values[:, k]
         if full_scale is not None:
-            count = int((np.abs(axis) >= 0.999 * full_scale).sum())
+            mask[:, k] = np.abs(axis) >= 0.999 * full_scale
         else:
-            count = sum(_count_clipped(sign * axis, SMALLEST_FULL_SCALE[k // 3]) for sign in (1, -1))
-        if count:
-            found[name] = count
-    return found
+            smallest = SMALLEST_FULL_SCALE[k // 3]
+            mask[:, k] = _clipped(axis, smallest) | _clipped(-axis, smallest)
+    return mask
+
+
+def find_saturation(samples: ImuSamples, noise: ImuNoise) -> dict[str, int]:
+    """How many samples of each axis sit at full scale; axes without any are left out."""
+    counts = saturated_samples(samples, noise).sum(axis=0)
+    return {name: int(count) for name, count in zip(AXES, counts, strict=True) if count}
+
+
+def _check_saturation(saturated: dict[str, int], total: int) -> None:
+    for name, count in saturated.items():
+        if count > SATURATED_SHARE * total:
+            raise ImuError(f"imu: {name} sits at full scale in {count} of {total} samples ({100 * count / total:.0f} %, "
+                           f"limit {100 * SATURATED_SHARE:.0f} %); record with a larger range")
 
 
 def gyro_in_degrees(samples: ImuSamples) -> bool:
@@ -187,15 +203,17 @@ def _lost_direction(turns: Array, force: Array) -> float:
     return float(np.median(1 - np.linalg.norm(total, axis=1) / force.shape[1]))
 
 
-def _count_clipped(axis: Array, smallest_full_scale: float) -> int:
-    """Samples in runs of equal values at the maximum of `axis`, if that can be a full scale and is an outlier."""
+def _clipped(axis: Array, smallest_full_scale: float) -> NDArray[np.bool_]:
+    """Samples (N,) in runs of equal values at the maximum of `axis`, if that can be a full scale and is an outlier."""
     top, middle = axis.max(), np.median(axis)
     spread = 1.4826 * np.median(np.abs(axis - middle))
+    mask = np.zeros(len(axis), bool)
     if top < smallest_full_scale or top - middle <= OUTLIER_SPREADS * spread:
-        return 0
+        return mask
     edges = np.diff(np.concatenate([[0], (axis == top).astype(np.int8), [0]]))
-    runs = np.flatnonzero(edges == -1) - np.flatnonzero(edges == 1)
-    return int(runs[runs >= SATURATED_RUN].sum())
+    for begin, end in zip(np.flatnonzero(edges == 1), np.flatnonzero(edges == -1), strict=True):
+        mask[begin:end] = end - begin >= SATURATED_RUN
+    return mask
 
 
 def _warnings(samples: ImuSamples, noise: ImuNoise, rate_hz: float, gaps: tuple[Gap, ...],

@@ -299,3 +299,10 @@ def test_oddities_are_warnings():
     words = ("40 Hz but the calibration says 100 Hz", "gyro z reads 0 in every sample", "1 gaps over 0.5 s")
     assert len(report.warnings) == 3
     assert all(word in line for word, line in zip(words, report.warnings, strict=True))
+
+
+def test_an_axis_lost_in_saturation_is_refused_by_name():
+    samples = resting(2000)
+    samples.gyro_rad_s[:, 1] = np.clip(9 * np.sin(np.arange(2000) * 0.3), -2.18, 2.18)
+    with pytest.raises(ImuError, match=r"gyro y sits at full scale in \d+ of 2000 samples .*limit 5 %"):
+        check_imu(samples, ImuNoise(gyro_range_rad_s=2.18))
