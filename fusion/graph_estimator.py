@@ -16,7 +16,7 @@ from fusion.estimate import Estimate, add_scale_uncertainty
 from fusion.graph import add_anchor, add_imu, add_scale_walk, read_log_scales, read_states
 from fusion.initialization import Start, chunked_start, search_log_scale
 from fusion.problem import Problem
-from fusion.result import ScaleConclusion
+from fusion.result import ScaleConclusion, ScalePolicy
 from fusion.scale import FreePass, Segments
 from fusion.solve import MotionTerm, Solution, gauss_newton, linear_graph
 from fusion.stages import Stages
@@ -98,41 +98,45 @@ class GraphEstimator:
         return _Pass(native, term, solution, chi2)
 
     def _decide(self, start: Start, fixed: _Pass, start_scale: float) -> tuple[_Pass, ScaleConclusion, float]:
-        """Try scale free; when that must not be believed, down-weight the accelerometer; else hold the scale."""
-        policy, limit = self.config.scale.policy, self.config.scale.imu_chi2_limit
+        """Try scale free; where it cannot be measured keep the prior's; where the IMU disagrees, trust it less."""
+        policy = self.config.scale.policy
         if policy == "fixed" or self.problem.scale_log_sd == 0:
             reason = "asked for" if policy == "fixed" else "the source declares its scale exactly known"
-            return self._held(fixed, start_scale, reason), self._held_conclusion(start_scale, reason), 1.0
-        objection = None
-        if policy in ("auto", "free"):
-            final, free = self._free_pass(start, fixed, start_scale)
-            objection = scale_policy.reasons_against(free, self.problem, self.config.scale)
-            if objection is None or policy == "free":
-                conclusion = scale_policy.conclude_free(free, self.problem)
-                if policy == "free":
-                    reason = f"asked for; {objection or conclusion.reason}"
-                    conclusion = replace(conclusion, policy="free", reason=reason)
-                return final, conclusion, 1.0
+            return self._held(fixed, "fixed", start_scale, reason, 1.0)
+        if policy == "prior":
+            return self._down_weighted(start_scale, "asked for")
+        final, free = self._free_pass(start, fixed, start_scale)
+        objection = scale_policy.reasons_against(free, self.problem, self.config.scale)
+        if policy == "free":
+            conclusion = scale_policy.conclude_free(free, self.problem)
+            return final, replace(conclusion, policy="free", reason=f"asked for; {objection or conclusion.reason}"), 1.0
+        if free.signal < scale_policy.LEAST_SIGNAL:
+            return self._held(fixed, "prior", start_scale, scale_policy.hardly_moved(free), 1.0)
+        if objection is None:
+            return final, scale_policy.conclude_free(free, self.problem), 1.0
+        return self._down_weighted(start_scale, objection)
+
+    def _down_weighted(self, start_scale: float, why: str) -> tuple[_Pass, ScaleConclusion, float]:
+        """Raise the accelerometer's noise until it agrees, with scale near its prior; in the end hold the scale."""
         for inflation in scale_policy.INFLATION_LADDER:
             with self.stages("accelerometer_down_weighted"):
-                weak_start = self._start(start_scale, inflation)
-                weak = self._fixed_pass(weak_start, start_scale)
-            if weak.imu_chi2 <= limit:
-                final, free = self._free_pass(weak_start, weak, start_scale)
-                if scale_policy.reasons_against(free, self.problem, self.config.scale) is None:
-                    reason = f"scale from the prior, accelerometer noise × {inflation:g}: {objection or 'asked for'}"
-                    conclusion = scale_policy.conclude_free(free, self.problem)
-                    conclusion = replace(conclusion, policy="prior", reason=reason)
-                    return final, conclusion, inflation
-        reason = f"scale held at its prior, accelerometer noise × {inflation:g}: {objection or 'asked for a prior'}"
-        return self._held(weak, start_scale, reason), self._held_conclusion(start_scale, reason), inflation
+                start = self._start(start_scale, inflation)
+                fixed = self._fixed_pass(start, start_scale)
+            if fixed.imu_chi2 > self.config.scale.imu_chi2_limit:
+                continue
+            final, free = self._free_pass(start, fixed, start_scale)
+            if scale_policy.reasons_against(free, self.problem, self.config.scale) is None:
+                reason = f"scale near its prior, accelerometer noise × {inflation:g}: {why}"
+                conclusion = scale_policy.conclude_free(free, self.problem)
+                return final, replace(conclusion, policy="prior", reason=reason), inflation
+        return self._held(fixed, "fixed", start_scale, f"held at the prior, accelerometer noise × {inflation:g}: {why}",
+                          inflation)
 
-    def _held_conclusion(self, log_scale: float, reason: str) -> ScaleConclusion:
-        return ScaleConclusion("fixed", log_scale, self.problem.scale_log_sd, reason)
-
-    def _held(self, fixed: _Pass, log_scale: float, reason: str) -> _Pass:
+    def _held(self, fixed: _Pass, policy: ScalePolicy, log_scale: float, reason: str,
+              inflation: float) -> tuple[_Pass, ScaleConclusion, float]:
         with self.stages("gate"):
-            return self._gated(fixed)
+            final = self._gated(fixed)
+        return final, ScaleConclusion(policy, log_scale, self.problem.scale_log_sd, reason), inflation
 
     def _free_pass(self, start: Start, fixed: _Pass, start_scale: float) -> tuple[_Pass, FreePass]:
         scale, problem = self.config.scale, self.problem
@@ -151,7 +155,8 @@ class GraphEstimator:
             variance = marginal_covariances(gaussian, 0, len(self.segments.t_s))[1]
         log_scale = read_log_scales(final.solution.values, len(self.segments.t_s))
         share = len(final.rejected) / len(problem.motions)
-        return final, FreePass(final.imu_chi2, log_scale, np.sqrt(variance), share)
+        signal = final.term.signal(final.solution.values)
+        return final, FreePass(final.imu_chi2, log_scale, np.sqrt(variance), share, signal)
 
     def _gated(self, huber: _Pass) -> _Pass:
         """Reject what lies beyond the gate, solve as Gaussian, and look again until the gate is settled."""

@@ -21,6 +21,8 @@ PLAUSIBLE_REJECTED = 0.15
 """Share of motions that may be gated before the freed scale is disbelieved."""
 INFORMATIVE = 0.5
 """The freed scale's sd must be below this share of the prior's to count as measured."""
+LEAST_SIGNAL = 1.5
+"""Steps over noise below which noise alone would pass for a larger scale: nothing is measured then."""
 INFLATION_LADDER = (3.0, 10.0, 50.0)
 
 
@@ -42,6 +44,8 @@ class FreePass:
     log_scale: Array
     log_scale_sd: Array
     rejected_share: float
+    signal: float
+    """Root mean square of the steps over their noise."""
 
 
 def make_segments(t_s: Array, length_s: float) -> Segments:
@@ -77,6 +81,12 @@ def reasons_against(free: FreePass, problem: Problem, config: ScaleConfig) -> st
         return (f"freeing the scale rejected {100 * free.rejected_share:.0f} % of the motions "
                 f"(limit {100 * PLAUSIBLE_REJECTED:.0f} %)")
     return None
+
+
+def hardly_moved(free: FreePass) -> str:
+    """The reason for keeping the prior's scale of a capsule at rest."""
+    return (f"the capsule hardly moved: its steps are {free.signal:.2f} times the motions' noise "
+            f"(limit {LEAST_SIGNAL:g}), so the prior's scale is kept")
 
 
 def conclude_free(free: FreePass, problem: Problem) -> ScaleConclusion:

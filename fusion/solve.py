@@ -68,6 +68,12 @@ class MotionTerm:
         squared: Array = np.einsum("nk,nk->n", r, r)
         return squared
 
+    def signal(self, values: gtsam.Values) -> float:
+        """Root mean square of the estimated steps over the motions' noise, per axis; gated motions left out."""
+        blocks = linearize(self.motions, *read_poses(values), self.log_scale(values))
+        squared = np.einsum("nki,nki->n", blocks.A_s, blocks.A_s)  # dr/ds is the whitened step itself
+        return float(np.sqrt(np.average(squared, weights=self.weight) / 3))
+
 
 @dataclass(frozen=True)
 class Solution:

@@ -98,8 +98,8 @@ def find_saturation(samples: ImuSamples, noise: ImuNoise) -> dict[str, int]:
 def _check_saturation(saturated: dict[str, int], total: int) -> None:
     for name, count in saturated.items():
         if count > SATURATED_SHARE * total:
-            raise ImuError(f"imu: {name} sits at full scale in {count} of {total} samples ({100 * count / total:.0f} %, "
-                           f"limit {100 * SATURATED_SHARE:.0f} %); record with a larger range")
+            raise ImuError(f"imu: {name} sits at full scale in {count} of {total} samples ({100 * count / total:.0f} %,"
+                           f" limit {100 * SATURATED_SHARE:.0f} %); record with a larger range")
 
 
 def gyro_in_degrees(samples: ImuSamples) -> bool:

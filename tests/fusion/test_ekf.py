@@ -80,7 +80,6 @@ def test_measurement_jacobian_is_the_derivative_of_the_innovation(problem, short
 def test_transition_is_the_derivative_of_the_prediction(problem, short):
     """To first order in a sample's turn, 25 ms at the capsule's rates: a few thousandths."""
     truth = short.recording.truth
-    F = running(problem, truth).filter.F
     numeric = np.zeros((DIM, DIM))
     for axis in range(DIM):
         ends = []
@@ -127,15 +126,16 @@ def test_an_update_shrinks_and_a_prediction_widens(problem, short):
     assert (np.diagonal(ekf.filter.P)[POS] > np.diagonal(updated)[POS]).all()
 
 
-@pytest.mark.parametrize("shape", [(DIM, 1), (DIM, DIM), (DIM - 3,)])
-def test_a_state_of_the_wrong_shape_is_caught(problem, short, shape):
-    """filterpy grows a (21, 1) state to (21, 21) in silence when it meets a residual of shape (6,)."""
+def test_a_state_of_the_wrong_shape_is_caught(problem, short):
+    """filterpy broadcasts a (21, 1) state with a (6,) residual into a matrix, in silence."""
     ekf = running(problem, short.recording.truth)
-    ekf.filter.x = np.zeros(shape)
-    with pytest.raises((EstimationError, ValueError)) as caught:
+    ekf.filter.x = np.zeros((DIM, 1))
+    with pytest.raises(EstimationError, match=r"ekf: the error state became \(21, 6\)"):
         ekf.update(AFTER)
-    if shape == (DIM, 1):
-        assert isinstance(caught.value, EstimationError) and "(21, 21)" in str(caught.value)
+    ekf = running(problem, short.recording.truth)
+    ekf.filter.x = np.full(DIM, np.nan)
+    with pytest.raises(EstimationError, match="not finite"):
+        ekf.update(AFTER)
 
 
 def estimate_of(problem, R0) -> Estimate:
@@ -174,10 +174,11 @@ def test_the_surest_of_several_motions_is_used(short):
     twice = replace(m, t_i_s=np.tile(m.t_i_s, 2), t_j_s=np.tile(m.t_j_s, 2), T_i_j=np.concatenate([wrong, m.T_i_j]),
                     cov=np.concatenate([100 * m.cov, m.cov]))
     R0 = short.recording.truth.rotations[0]
-    once = estimate_of(build_problem(short.recording, m), R0)
-    problem = replace(build_problem(short.recording, twice), gyro_bias_rad_s=build_problem(
-        short.recording, m).gyro_bias_rad_s)
-    np.testing.assert_array_equal(estimate_of(problem, R0).T_world_body, once.T_world_body)
+    alone = build_problem(short.recording, m)
+    once = estimate_of(alone, R0)
+    # The initial gyro bias is a median over all motions; here it is not what is tested.
+    problem = replace(build_problem(short.recording, twice), gyro_bias_rad_s=alone.gyro_bias_rad_s)
+    np.testing.assert_allclose(estimate_of(problem, R0).T_world_body, once.T_world_body, atol=1e-12)
 
 
 def test_a_filter_that_lost_track_says_so(examination):
