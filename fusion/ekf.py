@@ -159,11 +159,14 @@ def ekf_estimate(problem: Problem, R_world_body_first: Array, initial: InitialCo
         initial: standard deviations of the first state.
 
     Raises:
-        EstimationError: the state stopped being finite, or most motions looked like outliers.
+        EstimationError: no motion joins neighbours, most looked like outliers, or the state stopped being finite.
     """
+    motion_of = _consecutive_motions(problem)
+    updates = int((motion_of >= 0).sum())
+    if updates == 0:
+        raise EstimationError("ekf: no motion joins two neighbouring frames, and the filter uses no others")
     ekf = _CapsuleEkf(problem, R_world_body_first, initial)
     m = len(problem)
-    motion_of = _consecutive_motions(problem)
     T, cov, v = np.tile(np.eye(4), (m, 1, 1)), np.zeros((m, 6, 6)), np.zeros((m, 3))
     gyro_bias, accel_bias, outliers = np.zeros((m, 3)), np.zeros((m, 3)), []
     for k in range(m):
@@ -175,7 +178,6 @@ def ekf_estimate(problem: Problem, R_world_body_first: Array, initial: InitialCo
         cov[k], gyro_bias[k], accel_bias[k] = ekf.pose_cov(), ekf.gyro_bias, ekf.accel_bias
     if not np.isfinite(T).all():
         raise EstimationError("ekf: the trajectory is not finite")
-    updates = int((motion_of >= 0).sum())
     if len(outliers) > LOST_SHARE * updates:
         raise EstimationError(f"ekf: {len(outliers)} of {updates} motions looked like outliers (limit "
                               f"{100 * LOST_SHARE:.0f} %): the IMU disagrees with them and the filter lost track")

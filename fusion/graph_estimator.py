@@ -26,7 +26,8 @@ Array = NDArray[np.float64]
 
 COARSE_TOLERANCE = 1e-3
 """Of the Huber passes: they only have to tell outliers from the rest, and Huber alone would bias the scale."""
-GATED_WEIGHT = 1e-6
+GATED_SHARE = 0.1
+"""A rejected motion weighs this over its squared norm: the true step still lies within a few of its errors."""
 GATE_ROUNDS = 3
 
 
@@ -129,8 +130,10 @@ class GraphEstimator:
                 reason = f"scale near its prior, accelerometer noise × {inflation:g}: {why}"
                 conclusion = scale_policy.conclude_free(free, self.problem)
                 return final, replace(conclusion, policy="prior", reason=reason), inflation
-        return self._held(fixed, "fixed", start_scale, f"held at the prior, accelerometer noise × {inflation:g}: {why}",
-                          inflation)
+        with self.stages("accelerometer_down_weighted"):
+            fixed = self._fixed_pass(self._start(start_scale, scale_policy.GRAVITY_ONLY), start_scale)
+        reason = f"held at the prior, the accelerometer serves for the direction of gravity only: {why}"
+        return self._held(fixed, "fixed", start_scale, reason, scale_policy.GRAVITY_ONLY)
 
     def _held(self, fixed: _Pass, policy: ScalePolicy, log_scale: float, reason: str,
               inflation: float) -> tuple[_Pass, ScaleConclusion, float]:
@@ -162,9 +165,11 @@ class GraphEstimator:
         """Reject what lies beyond the gate, solve as Gaussian, and look again until the gate is settled."""
         current, gate, solver = huber, self.config.robust.gate, self.config.solver
         for _ in range(GATE_ROUNDS):
-            weight = np.where(current.solution.squared_norm < gate, 1.0, GATED_WEIGHT)
-            if current.term.huber is None and (weight == current.term.weight).all():
+            squared = current.solution.squared_norm
+            accepted = squared < gate
+            if current.term.huber is None and (accepted == (current.term.weight == 1.0)).all():
                 break
+            weight = np.where(accepted, 1.0, GATED_SHARE / np.maximum(squared, gate))
             term = replace(current.term, huber=None, weight=weight)
             solution = gauss_newton(current.native, current.solution.values, term, solver.max_iterations,
                                     solver.relative_tolerance)

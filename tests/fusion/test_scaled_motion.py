@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from fusion.scaled_motion import ScaledMotions, linearize, make_motions, residuals
 from vio import se3
 
-I, J = np.array([0, 0, 1, 2, 0, 3]), np.array([1, 3, 2, 4, 4, 4])  # neighbours and wide baselines
+FIRST, SECOND = np.array([0, 0, 1, 2, 0, 3]), np.array([1, 3, 2, 4, 4, 4])  # neighbours and wide baselines
 NODES = 5
 
 seeds = st.integers(0, 2**32 - 1)
@@ -36,12 +36,12 @@ def random_setup(seed, angle, error_angle, log_scale, error_units=0.1):
     steps = se3.transform(se3.so3_exp(angle * unit_vectors(rng, NODES - 1)), rng.normal(0, 0.005, (NODES - 1, 3)))
     T = se3.chain(steps, se3.exp(rng.normal(size=6)))
     camera = T @ T_bc
-    T_ij = se3.inverse(camera[I]) @ camera[J]
+    T_ij = se3.inverse(camera[FIRST]) @ camera[SECOND]
     T_ij[:, :3, 3] *= np.exp(-log_scale)
     size = np.linalg.norm(T_ij[:, :3, 3], axis=1, keepdims=True)
-    error = np.hstack([error_angle * unit_vectors(rng, len(I)), error_units * size * unit_vectors(rng, len(I))])
-    cov = covariances(rng, len(I), 0.01, 0.1 * float(size.mean()))
-    return T, make_motions(I, J, T_ij @ se3.exp(error), cov, T_bc), cov
+    error = np.hstack([error_angle * unit_vectors(rng, len(FIRST)), error_units * size * unit_vectors(rng, len(FIRST))])
+    cov = covariances(rng, len(FIRST), 0.01, 0.1 * float(size.mean()))
+    return T, make_motions(FIRST, SECOND, T_ij @ se3.exp(error), cov, T_bc), cov
 
 
 def moved(T, node, xi):
@@ -76,7 +76,7 @@ def test_jacobians_are_the_derivatives(seed, angle, error_angle, log_scale):
             numeric[node, :, :, axis] = difference / (2 * h[axis])
     for n in range(len(motions)):
         for node in range(NODES):
-            expected = {I[n]: blocks.A_i[n], J[n]: blocks.A_j[n]}.get(node, np.zeros((6, 6)))
+            expected = {FIRST[n]: blocks.A_i[n], SECOND[n]: blocks.A_j[n]}.get(node, np.zeros((6, 6)))
             size = np.abs(expected).max() or 1e-9
             np.testing.assert_allclose(numeric[node, n], expected, atol=3e-6 * size)
     plus, minus = (residuals_at(motions, T, log_scale + step) for step in (1e-5, -1e-5))
@@ -89,7 +89,7 @@ def test_residual_is_zero_at_the_truth_and_only_there(seed, angle, log_scale):
     T, motions, _ = random_setup(seed, angle, 0.0, log_scale, error_units=0.0)
     assert np.abs(residuals_at(motions, T, log_scale)).max() < 1e-9
     body = motions.body_motion(log_scale)
-    np.testing.assert_allclose(body, se3.inverse(T[I]) @ T[J], atol=1e-12)
+    np.testing.assert_allclose(body, se3.inverse(T[FIRST]) @ T[SECOND], atol=1e-12)
     np.testing.assert_allclose(body[:, :3, :3], motions.body_rotation(), atol=1e-15)
     turned = moved(T, 4, np.array([1e-3, 0, 0, 0, 0, 0]))
     assert np.linalg.norm(residuals_at(motions, turned, log_scale)[3:], axis=1).min() > 1e-3
@@ -115,7 +115,7 @@ def test_equals_gtsams_between_factor_at_a_fixed_scale(seed, angle, log_scale):
         values.insert(X(k), gtsam.Pose3(T[k]))
     for n, body in enumerate(motions.body_motion(log_scale)):
         noise = gtsam.noiseModel.Gaussian.Covariance(Ad @ cov[n] @ Ad.T)
-        factor = gtsam.BetweenFactorPose3(X(I[n]), X(J[n]), gtsam.Pose3(body), noise)
+        factor = gtsam.BetweenFactorPose3(X(FIRST[n]), X(SECOND[n]), gtsam.Pose3(body), noise)
         assert 0.5 * blocks.squared_norm[n] == pytest.approx(factor.error(values), rel=1e-3)
         A = np.hstack([blocks.A_i[n], blocks.A_j[n]])
         theirs = factor.linearize(values).information()

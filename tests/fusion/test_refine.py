@@ -1,0 +1,401 @@
+"""The whole estimate on simulated examinations: what it gains, what it survives, and what it admits."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from fusion import RefineConfig, refine
+from fusion.config import ScaleConfig
+from fusion.graph_estimator import GraphEstimator
+from fusion.problem import build_problem
+from vio import se3
+from vio.consistency import coverage, fix_gauge, nees
+from vio.errors import EstimationError
+from vio.metrics import ate
+from vio.motions import RelativeMotions
+from vio.simulation import T_BODY_CAMERA
+
+# Held out: no threshold of fusion was chosen on these seeds.
+HELD_OUT = [("small-bowel", "gaussian", 3, 301), ("colon", "collision", 3, 302), ("stomach", "peristalsis", 4, 303),
+            ("colon", "none", 0, 304), ("small-bowel", "collision", 5, 306)]
+
+
+def error_m(refinement, mode="se3", which="trajectory"):
+    return ate(getattr(refinement, which), refinement.truth, mode).rmse_m
+
+
+def gain(refinement, mode="se3"):
+    """Share of the error of the motions alone that is left."""
+    return error_m(refinement, mode) / error_m(refinement, mode, "motions_only")
+
+
+def only(motions, keep):
+    return replace(motions, t_i_s=motions.t_i_s[keep], t_j_s=motions.t_j_s[keep], T_i_j=motions.T_i_j[keep],
+                   cov=motions.cov[keep])
+
+
+def joined(a, b):
+    return RelativeMotions(np.r_[a.t_i_s, b.t_i_s], np.r_[a.t_j_s, b.t_j_s], np.concatenate([a.T_i_j, b.T_i_j]),
+                           np.concatenate([a.cov, b.cov]), a.scale_log_mean, a.scale_log_sd)
+
+
+def sd_of(trajectory):
+    return np.sqrt(np.diagonal(trajectory.cov, axis1=1, axis2=2))
+
+
+# ---- what it gains ---------------------------------------------------------------------------
+
+@pytest.fixture(scope="module")
+def held_out(examine):
+    return [examine(organ, vibration, level, 70.0, seed) for organ, vibration, level, seed in HELD_OUT]
+
+
+def test_graph_beats_the_motions_on_every_held_out_examination(held_out):
+    for case in held_out:
+        refined = refine(case.recording, case.motions)
+        assert refined.estimator == "graph" and refined.fallback_reason is None
+        for mode in ("origin", "yaw4", "se3", "sim3"):
+            # Measured: 0.06 to 0.34 of the error is left.
+            assert gain(refined, mode) < 0.6, (case.recording.name, mode)
+        assert abs(refined.scale.log_mean - case.network.true_log_scale.mean()) < 3 * refined.scale.log_sd
+
+
+def test_ekf_beats_the_motions_up_to_the_scale_that_it_holds(held_out, configured):
+    """With the scale 2 prior sds off, 5 mm are left of 5 mm: a filter that holds scale can not know better."""
+    gains = []
+    for case in held_out:
+        refined = refine(case.recording, case.motions, configured(estimator="ekf"))
+        assert refined.estimator == "ekf" and refined.scale.policy == "fixed"
+        assert gain(refined, "sim3") < 0.6, case.recording.name
+        gains.append(gain(refined))
+    assert np.exp(np.mean(np.log(gains))) < 0.4
+    assert max(gains) < 1.3
+
+
+def test_claimed_covariances_are_honest(held_out, configured):
+    """NEES 1 is perfect; reported motion covariances are off by 20 % in sd, which alone makes 1.08."""
+    for estimator, highest in (("graph", 2.0), ("ekf", 4.0)):
+        values = []
+        for case in held_out:
+            refined = refine(case.recording, case.motions, configured(estimator=estimator))
+            values.append(np.nanmean(nees(refined.trajectory, refined.truth)))
+        assert 0.3 < np.exp(np.mean(np.log(values))) < highest / 1.3, values
+        assert max(values) < highest, values
+
+
+def test_the_world_is_level_and_starts_at_the_origin(refined):
+    first = refined.trajectory.T_world_body[0]
+    np.testing.assert_allclose(first[:3, 3], 0, atol=1e-4)
+    up_in_body = refined.trajectory.rotations[:, 2], refined.truth.rotations[:, 2]
+    tilt = np.arccos(np.clip(np.einsum("nk,nk->n", *up_in_body), -1, 1))
+    assert np.rad2deg(tilt).max() < 0.5
+    cov = refined.trajectory.cov[0]
+    R = first[:3, :3]
+    world = R @ cov[:3, :3] @ R.T
+    assert np.sqrt(world[2, 2]) < 2e-5 and np.sqrt(np.trace(cov[3:, 3:])) < 2e-5  # the gauge: exact yaw and position
+
+
+def test_biases_and_velocities_are_found(refined, examination):
+    state = examination.recording.truth_state
+    np.testing.assert_allclose(refined.gyro_bias_rad_s, state.gyro_bias_rad_s, atol=5e-4)
+    np.testing.assert_allclose(refined.accel_bias_m_s2, state.accel_bias_m_s2, atol=0.02)
+    moved = fix_gauge(refined.trajectory, refined.truth)
+    turn = moved.rotations[0] @ refined.truth.rotations[0].T
+    assert np.sqrt(np.mean(np.square(refined.velocity_m_s - state.velocity_m_s @ turn.T))) < 1e-3
+
+
+def test_outliers_are_found(refined, examination):
+    outliers = np.flatnonzero(examination.network.is_outlier)
+    assert len(outliers) >= 4 and np.isin(outliers, refined.rejected).all()
+    assert len(refined.rejected) <= 2 * len(outliers)
+    assert refined.motions_used == len(examination.motions) - len(refined.rejected)
+
+
+def test_motions_alone_are_the_chain_at_the_prior_scale(refined, examination):
+    scale = np.exp(examination.motions.scale_log_mean)
+    T = refined.trajectory.T_world_body[0] @ T_BODY_CAMERA
+    for step in examination.motions.T_i_j:
+        metric = step.copy()
+        metric[:3, 3] *= scale
+        T = T @ metric
+    np.testing.assert_allclose(refined.motions_only.T_world_body[-1], T @ np.linalg.inv(T_BODY_CAMERA), atol=1e-9)
+
+
+# ---- the same every time ---------------------------------------------------------------------
+
+@pytest.mark.parametrize("estimator", ["graph", "ekf"])
+def test_two_runs_give_the_same_bytes(short, configured, estimator):
+    a, b = (refine(short.recording, short.motions, configured(estimator=estimator)) for _ in range(2))
+    for name in ("velocity_m_s", "gyro_bias_rad_s", "accel_bias_m_s2", "log_scale", "log_scale_sd", "rejected"):
+        assert getattr(a, name).tobytes() == getattr(b, name).tobytes(), name
+    assert a.trajectory.T_world_body.tobytes() == b.trajectory.T_world_body.tobytes()
+    assert a.trajectory.cov.tobytes() == b.trajectory.cov.tobytes()
+    assert a.scale == b.scale and a.imu == b.imu
+
+
+def test_inputs_are_not_changed(short):
+    imu, motions = short.recording.imu, short.motions
+    before = [x.copy() for x in (imu.t_ns, imu.gyro_rad_s, imu.accel_m_s2, motions.T_i_j, motions.cov)]
+    refine(short.recording, short.motions)
+    for old, new in zip(before, (imu.t_ns, imu.gyro_rad_s, imu.accel_m_s2, motions.T_i_j, motions.cov), strict=True):
+        np.testing.assert_array_equal(old, new)
+
+
+def test_stages_are_announced_as_they_begin(short):
+    heard = []
+    refined = refine(short.recording, short.motions, announce=heard.append)
+    assert heard[0] == "checks" and heard[-1] == "covariances"
+    assert set(heard) == set(refined.timing_s)
+
+
+# ---- rest, gaps, sparse motions --------------------------------------------------------------
+
+@pytest.mark.parametrize("estimator", ["graph", "ekf"])
+def test_half_an_hour_at_rest_stays_where_it_is(examine, configured, estimator):
+    duration_s = 1800.0 if estimator == "graph" else 300.0
+    still = examine("small-bowel", "none", 0, duration_s, 311, mode="rest", frame_rate_hz=0.5)
+    refined = refine(still.recording, still.motions, configured(estimator=estimator))
+    assert refined.estimator == estimator and len(refined.trajectory) == duration_s / 2
+    assert refined.scale.policy != "free"
+    # The chain's noise is 50 um per axis and step; outliers and the lever arm's rotation noise make it 10 to 20 mm.
+    off = refined.trajectory.positions_m
+    assert np.abs(off).max() < 0.04
+    assert np.linalg.norm(refined.velocity_m_s, axis=1).max() < 1e-3
+    sd = sd_of(refined.trajectory)[:, 3:]
+    assert np.abs(off[1:] / sd[1:]).max() < 4
+    assert (np.abs(refined.gyro_bias_rad_s - still.recording.truth_state.gyro_bias_rad_s) < 2e-3).all()
+
+
+@pytest.mark.parametrize("estimator", ["graph", "ekf"])
+def test_a_gap_in_the_imu_is_listed_and_widens_what_was_not_seen(examination, configured, refined, estimator):
+    imu_t = examination.recording.imu_t_s
+    gapped = examination.with_samples((imu_t < 50) | (imu_t > 52))
+    config = configured(estimator=estimator)
+    result = refine(gapped, examination.motions, config)
+    assert result.estimator == estimator
+    gap, = result.imu.gaps
+    assert (gap.start_s, gap.end_s) == (pytest.approx(50, abs=0.03), pytest.approx(52, abs=0.03))
+    assert gain(result) < 0.7
+    before, after = 149, 157  # 49.67 s and 52.33 s
+    def turn_sd(trajectory):
+        """Uncertainty that a stretch adds to the attitude."""
+        total = np.sqrt((sd_of(trajectory)[:, :3] ** 2).sum(axis=1))
+        return np.sqrt(total[after] ** 2 - total[before] ** 2)
+
+    whole = refine(examination.recording, examination.motions, config)
+    assert turn_sd(result.trajectory) > 5 * turn_sd(whole.trajectory)
+    # The motions bridge it: their rotations are known to 0.3 degrees each, within a factor for the reported sd.
+    assert np.deg2rad(0.3) < turn_sd(result.trajectory) < np.deg2rad(5)
+
+
+def test_lost_radio_takes_imu_and_motions_together(examination):
+    imu_t, motions = examination.recording.imu_t_s, examination.motions
+    gapped = examination.with_samples((imu_t < 50) | (imu_t > 52))
+    heard = only(motions, (motions.t_i_s < 49.5) | (motions.t_i_s > 52))
+    refined = refine(gapped, heard)
+    assert refined.estimator == "graph" and refined.bridged == len(motions) - len(heard) == 8
+    assert gain(refined) < 1
+    along = np.sqrt((sd_of(refined.trajectory)[:, 3:] ** 2).sum(axis=1))
+    assert along[160] > 5 * along[148]  # nothing was seen: so it says
+
+
+@pytest.mark.parametrize("estimator", ["graph", "ekf"])
+def test_pairs_without_a_motion_are_counted_and_bridged_by_the_imu(examination, configured, estimator):
+    keep = np.ones(len(examination.motions), bool)
+    keep[[40, 41, 42, 150, 200]] = False
+    refined = refine(examination.recording, only(examination.motions, keep), configured(estimator=estimator))
+    assert refined.bridged == 5
+    assert len(refined.trajectory) == 300
+    assert gain(refined) < 0.7
+
+
+def test_only_the_frames_that_the_motions_span_are_placed(examination):
+    refined = refine(examination.recording, only(examination.motions, slice(100, 160)))
+    assert len(refined.trajectory) == 61
+    np.testing.assert_array_equal(refined.trajectory.t_s, examination.recording.frame_t_s[100:161])
+    assert gain(refined) < 0.7
+
+
+@pytest.mark.parametrize("count", [1, 2, 3, 5, 10])
+def test_a_few_frames_are_enough(examination, count):
+    refined = refine(examination.recording, only(examination.motions, slice(0, count)))
+    assert refined.estimator == "graph" and len(refined.trajectory) == count + 1
+    assert error_m(refined, "origin") < 1.5e-3
+
+
+def wide_motions(examination, span, every=1):
+    """Motions from frame k to k + span, measured independently with the noise of the others."""
+    rng = np.random.default_rng(5)
+    camera = examination.recording.truth.T_world_body @ T_BODY_CAMERA
+    k = np.arange(0, len(camera) - span, every)
+    T = se3.inverse(camera[k]) @ camera[k + span]
+    units = np.exp(-examination.network.true_log_scale[k])
+    step = np.linalg.norm(T[:, :3, 3], axis=1)
+    sd = np.repeat([[np.deg2rad(0.3), 1.0]], 3, axis=1) * np.ones((len(k), 6))
+    sd[:, 3:] *= ((0.03 * step + 5e-5) * units)[:, None]
+    T[:, :3, 3] *= units[:, None]
+    cov = np.zeros((len(k), 6, 6))
+    cov[:, np.arange(6), np.arange(6)] = sd**2
+    t = examination.recording.truth.t_s
+    prior = examination.motions
+    return RelativeMotions(t[k], t[k + span], T @ se3.exp(sd * rng.standard_normal(sd.shape)), cov,
+                           prior.scale_log_mean, prior.scale_log_sd)
+
+
+def test_wide_baselines_help_the_graph(examination, refined, configured):
+    both = joined(examination.motions, wide_motions(examination, 2))
+    wider = refine(examination.recording, both)
+    assert wider.estimator == "graph" and wider.motions_used + len(wider.rejected) == 597
+    assert error_m(wider) < error_m(refined)
+    assert sd_of(wider.trajectory)[-1, 3:].max() < sd_of(refined.trajectory)[-1, 3:].max()
+    np.testing.assert_array_equal(wider.motions_only.positions_m[0], wider.trajectory.positions_m[0])
+    assert error_m(wider, which="motions_only") == pytest.approx(error_m(refined, which="motions_only"), rel=1e-6)
+
+
+def test_key_frames_alone_are_enough_for_the_graph_but_not_for_the_filter(examination, configured):
+    motions = wide_motions(examination, 3, every=3)
+    refined = refine(examination.recording, motions)
+    assert refined.estimator == "graph" and error_m(refined) < 0.01
+    assert refined.bridged == len(refined.trajectory) - 1  # what the chain of the motions alone cannot use
+    with pytest.raises(EstimationError, match="no motion joins two neighbouring frames"):
+        refine(examination.recording, motions, configured(estimator="ekf"))
+
+
+# ---- scale -----------------------------------------------------------------------------------
+
+def test_a_metric_source_keeps_its_scale(examination, configured):
+    exact = replace(examination.motions, scale_log_sd=0.0)
+    refined = refine(examination.recording, exact)
+    assert refined.estimator == "graph"
+    assert refined.scale.policy == "fixed" and refined.scale.log_sd == 0
+    assert (refined.log_scale == exact.scale_log_mean).all() and (refined.log_scale_sd == 0).all()
+
+
+@pytest.mark.parametrize("policy", ["free", "prior", "fixed"])
+def test_a_policy_that_was_asked_for_is_followed(examination, configured, policy):
+    refined = refine(examination.recording, examination.motions, configured(scale=ScaleConfig(policy=policy)))
+    assert refined.scale.policy == policy and "asked for" in refined.scale.reason
+    assert gain(refined) < 0.8
+
+
+@pytest.mark.parametrize(("off", "sd"), [(1.0, 1.0), (-1.5, 1.5), (0.5, 3.0)])
+def test_a_vague_prior_is_searched(examination, off, sd):
+    vague = replace(examination.motions, scale_log_mean=examination.motions.scale_log_mean + off, scale_log_sd=sd)
+    refined = refine(examination.recording, vague)
+    assert refined.scale.policy == "free"
+    assert abs(refined.scale.log_mean - examination.network.true_log_scale.mean()) < 0.1
+    assert gain(refined) < 0.3
+
+
+def test_free_scale_intervals_cover_the_truth(held_out):
+    inside = []
+    for case in held_out:
+        refined = refine(case.recording, case.motions)
+        inside.append(coverage(refined.log_scale[:-1], refined.log_scale_sd[:-1], case.network.true_log_scale))
+    assert np.mean(inside) > 0.75, inside
+
+
+# ---- a body that moves in ways the camera does not see ---------------------------------------
+
+@pytest.fixture(scope="module")
+def living(examine):
+    return examine("small-bowel", "gaussian", 2, 100.0, 202)
+
+
+@pytest.mark.parametrize(("amplitude_m", "frequency_hz"), [(0.005, 0.25), (0.001, 1.0)], ids=["breathing", "shifting"])
+def test_breathing_takes_the_scale_from_the_imu(living, amplitude_m, frequency_hz):
+    refined = refine(living.shaken_unseen(amplitude_m, frequency_hz), living.motions)
+    assert refined.estimator == "graph"
+    assert refined.scale.policy in ("prior", "fixed") and refined.imu.inflation > 1
+    assert "accelerometer noise ×" in refined.scale.reason
+    assert gain(refined) < 0.7
+
+
+@pytest.fixture(scope="module")
+def walking(living):
+    """20 mm at 1.7 Hz: two and a half times 1 m/s², which shakes the IMU and nothing that the camera sees."""
+    return refine(living.shaken_unseen(0.02, 1.7), living.motions)
+
+
+def test_walking_is_noticed(walking):
+    assert walking.scale.policy != "free"
+    assert walking.fallback_reason or walking.imu.inflation > 1
+    assert abs(walking.scale.log_mean - np.log(0.8)) < 0.3
+
+
+@pytest.mark.xfail(strict=True, reason="where a motion is gated, the down-weighted accelerometer alone bridges the "
+                                       "interval and jumps by centimetres: 33 to 48 mm against 5 mm")
+def test_walking_does_no_harm(walking):
+    assert gain(walking) < 1.5
+
+
+# ---- the policy ------------------------------------------------------------------------------
+
+def refuse(message):
+    def estimate(*_args, **_kwargs):
+        raise EstimationError(message)
+
+    return estimate
+
+
+def test_forced_ekf_has_no_reason_to_explain(short, configured):
+    refined = refine(short.recording, short.motions, configured(estimator="ekf"))
+    assert refined.estimator == "ekf" and refined.fallback_reason is None
+    assert refined.imu.chi2_per_dof is None
+
+
+def test_auto_falls_to_the_filter_and_says_why(short, monkeypatch):
+    monkeypatch.setattr(GraphEstimator, "estimate", refuse("graph: the cost is nan"))
+    refined = refine(short.recording, short.motions)
+    assert (refined.estimator, refined.fallback_reason) == ("ekf", "graph: the cost is nan")
+    forced = refine(short.recording, short.motions, RefineConfig(estimator="ekf"))
+    np.testing.assert_array_equal(refined.trajectory.T_world_body, forced.trajectory.T_world_body)
+
+
+def test_auto_falls_to_the_motions_and_says_why(short, monkeypatch):
+    monkeypatch.setattr(GraphEstimator, "estimate", refuse("graph: one"))
+    monkeypatch.setattr("fusion.refine.ekf_estimate", refuse("ekf: two"))
+    refined = refine(short.recording, short.motions)
+    assert (refined.estimator, refined.fallback_reason) == ("motions", "graph: one; ekf: two")
+    np.testing.assert_allclose(refined.trajectory.T_world_body, refined.motions_only.T_world_body, atol=1e-12)
+    assert refined.scale.policy == "fixed" and len(refined.rejected) == 0
+    sd = np.sqrt((sd_of(refined.trajectory)[:, 3:] ** 2).sum(axis=1))
+    assert (np.diff(sd) > 0).mean() > 0.8 and sd[-1] > 10 * sd[1]  # nothing holds a chain: it only gets worse
+    assert 0.01 < np.nanmean(nees(refined.trajectory, refined.truth)) < 30
+
+
+def test_a_forced_graph_that_fails_is_an_error(short, configured, monkeypatch):
+    monkeypatch.setattr(GraphEstimator, "estimate", refuse("graph: the cost is nan"))
+    with pytest.raises(EstimationError, match="^graph: the cost is nan$") as caught:
+        refine(short.recording, short.motions, configured(estimator="graph"))
+    assert caught.value.exit_code == 4
+
+
+def test_a_forced_filter_that_fails_is_an_error(living, configured):
+    with pytest.raises(EstimationError, match="ekf: .* looked like outliers"):
+        refine(living.shaken_unseen(0.02, 1.7), living.motions, configured(estimator="ekf"))
+
+
+@pytest.mark.parametrize(("spoil", "words"), [
+    (lambda e: replace(e, T_world_body=np.where(np.arange(16).reshape(4, 4) == 3, np.nan, e.T_world_body)), "not finite"),
+    (lambda e: replace(e, cov=-e.cov), "variance is"),
+    (lambda e: replace(e, cov=np.full_like(e.cov, np.inf)), "not finite"),
+])
+def test_numbers_that_are_no_answer_are_stepped_over(short, monkeypatch, spoil, words):
+    estimate = GraphEstimator.estimate
+    monkeypatch.setattr(GraphEstimator, "estimate", lambda self: spoil(estimate(self)))
+    refined = refine(short.recording, short.motions)
+    assert refined.estimator == "ekf"
+    assert refined.fallback_reason.startswith("graph: ") and words in refined.fallback_reason
+
+
+def test_without_any_usable_imu_the_motions_still_lead(examination):
+    """A sample every 1.1 s leaves a gap in every frame interval: the graph says so, the filter coasts on motions."""
+    every = np.arange(0, len(examination.recording.imu), 45)
+    sparse = examination.with_samples(every)
+    assert not build_problem(sparse, examination.motions).imu_usable.any()
+    refined = refine(sparse, examination.motions)
+    assert refined.estimator in ("ekf", "motions")
+    assert refined.fallback_reason.startswith("graph: no frame interval has usable IMU data")
+    assert gain(refined) < 1.5
