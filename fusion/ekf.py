@@ -184,8 +184,9 @@ def ekf_estimate(problem: Problem, R_world_body_first: Array, initial: InitialCo
     mean, sd = problem.scale_log_mean, problem.scale_log_sd
     reason = "the filter holds scale at its prior: a filter's free scale is biased"
     conclusion = ScaleConclusion("fixed", mean, sd, reason)
-    return Estimate(T, add_scale_uncertainty(T, cov, sd), v, gyro_bias, accel_bias, np.full(m, mean), np.full(m, sd),
-                    conclusion, np.array(outliers, np.int64))
+    cov = add_scale_uncertainty(T, cov, sd, problem.motions.T_body_camera)
+    return Estimate(T, cov, v, gyro_bias, accel_bias, np.full(m, mean), np.full(m, sd), conclusion,
+                    np.array(outliers, np.int64))
 
 
 def _consecutive_motions(problem: Problem) -> NDArray[np.int64]:

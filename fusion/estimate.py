@@ -40,12 +40,14 @@ class Estimate:
     imu_inflation: float = 1.0
 
 
-def add_scale_uncertainty(T_world_body: Array, cov: Array, log_scale_sd: float) -> Array:
+def add_scale_uncertainty(T_world_body: Array, cov: Array, log_scale_sd: float, T_body_camera: Array) -> Array:
     """Covariances (M, 6, 6) widened for a scale that was assumed, not estimated.
 
-    A scale error stretches the track about its first pose: d(position)/ds = position - first position.
+    A scale error stretches the CAMERA's track about its first position and turns nothing, so the body is
+    shifted by as much as the camera: d(position)/ds = camera's position - its first.
     """
-    away = T_world_body[:, :3, 3] - T_world_body[0, :3, 3]
+    camera = (T_world_body @ T_body_camera)[:, :3, 3]
+    away = camera - camera[0]
     g = np.zeros((len(away), 6))
     g[:, 3:] = (np.swapaxes(T_world_body[:, :3, :3], 1, 2) @ away[:, :, None])[:, :, 0]
     widened: Array = cov + log_scale_sd**2 * g[:, :, None] * g[:, None, :]
@@ -64,8 +66,9 @@ def motions_estimate(problem: Problem, motions: RelativeMotions, T_world_first: 
     m = len(problem)
     sd = problem.scale_log_sd
     velocity = np.gradient(T[:, :3, 3], problem.t_s, axis=0)
+    cov = add_scale_uncertainty(T, cov, sd, T_body_camera)
     return Estimate(
-        T, add_scale_uncertainty(T, cov, sd), velocity, np.tile(problem.gyro_bias_rad_s, (m, 1)), np.zeros((m, 3)),
+        T, cov, velocity, np.tile(problem.gyro_bias_rad_s, (m, 1)), np.zeros((m, 3)),
         np.full(m, problem.scale_log_mean), np.full(m, sd),
         ScaleConclusion("fixed", problem.scale_log_mean, sd, "no estimator ran; the prior scale is used as it is"),
         np.zeros(0, np.int64),

@@ -189,6 +189,6 @@ class GraphEstimator:
             log_scale_sd = np.sqrt(variance)[of_node]
         else:
             log_scale, log_scale_sd = np.full(m, conclusion.log_mean), np.full(m, conclusion.log_sd)
-            cov = add_scale_uncertainty(T, cov, conclusion.log_sd)
+            cov = add_scale_uncertainty(T, cov, conclusion.log_sd, self.problem.motions.T_body_camera)
         return Estimate(T, cov, states.v, states.gyro_bias, states.accel_bias, log_scale, log_scale_sd, conclusion,
                         final.rejected, fixed_chi2, inflation)

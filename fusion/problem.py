@@ -63,8 +63,8 @@ def build_problem(recording: Recording, motions: RelativeMotions) -> Problem:
     Raises:
         VioError: any input that cannot be used, in one line.
     """
+    check_imu(recording.imu, recording.calibration.imu_noise)  # first: unsorted stamps would look like missing ones
     check_refinable(recording)
-    check_imu(recording.imu, recording.calibration.imu_noise)
     i, j = match_frames(motions, recording.frame_t_s)
     lo, hi = int(i.min()), int(j.max())
     t = recording.frame_t_s[lo:hi + 1]

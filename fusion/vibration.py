@@ -13,7 +13,7 @@ from vio.imu import ImuNoise, ImuSamples
 
 Array = NDArray[np.float64]
 
-ACCEL_SHARE, GYRO_SHARE = 0.25, 0.25
+ACCEL_SHARE, GYRO_SHARE = 0.15, 0.3
 """Share of the excess second difference that ends up as integration error; see docs/results."""
 QUIET = 2.0
 """Power in units of white noise's below which nothing is inflated: a dozen samples scatter that much."""

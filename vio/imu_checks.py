@@ -120,7 +120,7 @@ def _check_stamps(samples: ImuSamples) -> Array:
         if shape != (n, 3):
             raise ImuError(f"imu: {n} stamps but {name} of shape {shape}; expected ({n}, 3)")
     if n < 2:
-        raise ImuError(f"imu: {n} samples; at least 2 are needed")
+        raise ImuError(f"imu: {n} samples; at least 2 are needed, give a stream that covers all frames")
     t = samples.t_ns
     bad = t[1:] <= t[:-1]
     if bad.any():

@@ -1,5 +1,6 @@
 """The whole estimate on simulated examinations: what it gains, what it survives, and what it admits."""
 
+import importlib
 from dataclasses import replace
 
 import numpy as np
@@ -7,6 +8,7 @@ import pytest
 
 from fusion import RefineConfig, refine
 from fusion.config import ScaleConfig
+from fusion.estimate import motions_estimate
 from fusion.graph_estimator import GraphEstimator
 from fusion.problem import build_problem
 from vio import se3
@@ -48,12 +50,16 @@ def sd_of(trajectory):
 
 @pytest.fixture(scope="module")
 def held_out(examine):
-    return [examine(organ, vibration, level, 70.0, seed) for organ, vibration, level, seed in HELD_OUT]
+    """Examinations with what the graph and the filter make of them."""
+    cases = [examine(organ, vibration, level, 70.0, seed) for organ, vibration, level, seed in HELD_OUT]
+    filtered = RefineConfig(estimator="ekf")
+    return [(case, {"graph": refine(case.recording, case.motions),
+                    "ekf": refine(case.recording, case.motions, filtered)}) for case in cases]
 
 
 def test_graph_beats_the_motions_on_every_held_out_examination(held_out):
-    for case in held_out:
-        refined = refine(case.recording, case.motions)
+    for case, results in held_out:
+        refined = results["graph"]
         assert refined.estimator == "graph" and refined.fallback_reason is None
         for mode in ("origin", "yaw4", "se3", "sim3"):
             # Measured: 0.06 to 0.34 of the error is left.
@@ -61,11 +67,11 @@ def test_graph_beats_the_motions_on_every_held_out_examination(held_out):
         assert abs(refined.scale.log_mean - case.network.true_log_scale.mean()) < 3 * refined.scale.log_sd
 
 
-def test_ekf_beats_the_motions_up_to_the_scale_that_it_holds(held_out, configured):
-    """With the scale 2 prior sds off, 5 mm are left of 5 mm: a filter that holds scale can not know better."""
+def test_ekf_beats_the_motions_up_to_the_scale_that_it_holds(held_out):
+    """Where the scale is two prior sds off, 5 mm are left of 5 mm: a filter that holds scale cannot know better."""
     gains = []
-    for case in held_out:
-        refined = refine(case.recording, case.motions, configured(estimator="ekf"))
+    for case, results in held_out:
+        refined = results["ekf"]
         assert refined.estimator == "ekf" and refined.scale.policy == "fixed"
         assert gain(refined, "sim3") < 0.6, case.recording.name
         gains.append(gain(refined))
@@ -73,15 +79,18 @@ def test_ekf_beats_the_motions_up_to_the_scale_that_it_holds(held_out, configure
     assert max(gains) < 1.3
 
 
-def test_claimed_covariances_are_honest(held_out, configured):
-    """NEES 1 is perfect; reported motion covariances are off by 20 % in sd, which alone makes 1.08."""
-    for estimator, highest in (("graph", 2.0), ("ekf", 4.0)):
-        values = []
-        for case in held_out:
-            refined = refine(case.recording, case.motions, configured(estimator=estimator))
-            values.append(np.nanmean(nees(refined.trajectory, refined.truth)))
-        assert 0.3 < np.exp(np.mean(np.log(values))) < highest / 1.3, values
-        assert max(values) < highest, values
+@pytest.mark.parametrize(("estimator", "highest"), [("graph", 2.0), ("ekf", 4.0)])
+def test_claimed_covariances_are_honest(held_out, estimator, highest):
+    """NEES 1 is perfect; the reported covariances of the motions are off by 20 % in sd, which alone makes 1.08."""
+    values = [np.nanmean(nees(results[estimator].trajectory, results[estimator].truth)) for _, results in held_out]
+    assert max(values) < highest, values
+    assert 0.5 < np.exp(np.mean(np.log(values))) < highest / 1.3, values
+
+
+def test_free_scale_intervals_cover_the_truth(held_out):
+    inside = [coverage(results["graph"].log_scale[:-1], results["graph"].log_scale_sd[:-1],
+                       case.network.true_log_scale) for case, results in held_out]
+    assert np.mean(inside) > 0.75, inside
 
 
 def test_the_world_is_level_and_starts_at_the_origin(refined):
@@ -151,20 +160,36 @@ def test_stages_are_announced_as_they_begin(short):
 
 # ---- rest, gaps, sparse motions --------------------------------------------------------------
 
-@pytest.mark.parametrize("estimator", ["graph", "ekf"])
-def test_half_an_hour_at_rest_stays_where_it_is(examine, configured, estimator):
-    duration_s = 1800.0 if estimator == "graph" else 300.0
-    still = examine("small-bowel", "none", 0, duration_s, 311, mode="rest", frame_rate_hz=0.5)
-    refined = refine(still.recording, still.motions, configured(estimator=estimator))
-    assert refined.estimator == estimator and len(refined.trajectory) == duration_s / 2
-    assert refined.scale.policy != "free"
-    # The chain's noise is 50 um per axis and step; outliers and the lever arm's rotation noise make it 10 to 20 mm.
+def test_half_an_hour_at_rest_stays_where_it_is(examine):
+    still = examine("small-bowel", "none", 0, 1800.0, 311, mode="rest", frame_rate_hz=0.5)
+    refined = refine(still.recording, still.motions)
+    assert refined.estimator == "graph" and len(refined.trajectory) == 900
+    assert refined.scale.policy == "prior"
+    # A chain of 900 motions with 0.05 mm of noise per axis, a lever arm and 18 outliers wanders 8 mm.
     off = refined.trajectory.positions_m
     assert np.abs(off).max() < 0.04
-    assert np.linalg.norm(refined.velocity_m_s, axis=1).max() < 1e-3
-    sd = sd_of(refined.trajectory)[:, 3:]
-    assert np.abs(off[1:] / sd[1:]).max() < 4
-    assert (np.abs(refined.gyro_bias_rad_s - still.recording.truth_state.gyro_bias_rad_s) < 2e-3).all()
+    assert np.abs(off[1:] / sd_of(refined.trajectory)[1:, 3:]).max() < 4
+    assert np.linalg.norm(refined.velocity_m_s, axis=1).max() < 0.01  # 2 s of accelerometer noise: 2 mm/s per axis
+    np.testing.assert_allclose(refined.gyro_bias_rad_s, still.recording.truth_state.gyro_bias_rad_s, atol=1e-3)
+    assert np.nanmean(nees(refined.trajectory, refined.truth)) < 3
+
+
+@pytest.fixture(scope="module")
+def filtered_rest(examine, configured):
+    still = examine("small-bowel", "none", 0, 100.0, 313, mode="rest")
+    return refine(still.recording, still.motions, configured(estimator="ekf"))
+
+
+def test_the_filter_stays_at_rest_too(filtered_rest):
+    off = filtered_rest.trajectory.positions_m
+    assert np.abs(off).max() < 0.01
+    assert np.abs(off[1:] / sd_of(filtered_rest.trajectory)[1:, 3:]).max() < 4
+
+
+@pytest.mark.xfail(strict=True, reason="at rest the filter believes to tell tilt from accelerometer bias: 3 mrad "
+                                       "claimed, 30 mrad off; the known inconsistency of an EKF's linearisation")
+def test_the_filter_is_honest_at_rest(filtered_rest):
+    assert np.nanmean(nees(filtered_rest.trajectory, filtered_rest.truth)) < 4
 
 
 @pytest.mark.parametrize("estimator", ["graph", "ekf"])
@@ -288,14 +313,6 @@ def test_a_vague_prior_is_searched(examination, off, sd):
     assert gain(refined) < 0.3
 
 
-def test_free_scale_intervals_cover_the_truth(held_out):
-    inside = []
-    for case in held_out:
-        refined = refine(case.recording, case.motions)
-        inside.append(coverage(refined.log_scale[:-1], refined.log_scale_sd[:-1], case.network.true_log_scale))
-    assert np.mean(inside) > 0.75, inside
-
-
 # ---- a body that moves in ways the camera does not see ---------------------------------------
 
 @pytest.fixture(scope="module")
@@ -312,22 +329,13 @@ def test_breathing_takes_the_scale_from_the_imu(living, amplitude_m, frequency_h
     assert gain(refined) < 0.7
 
 
-@pytest.fixture(scope="module")
-def walking(living):
-    """20 mm at 1.7 Hz: two and a half times 1 m/s², which shakes the IMU and nothing that the camera sees."""
-    return refine(living.shaken_unseen(0.02, 1.7), living.motions)
-
-
-def test_walking_is_noticed(walking):
-    assert walking.scale.policy != "free"
-    assert walking.fallback_reason or walking.imu.inflation > 1
-    assert abs(walking.scale.log_mean - np.log(0.8)) < 0.3
-
-
-@pytest.mark.xfail(strict=True, reason="where a motion is gated, the down-weighted accelerometer alone bridges the "
-                                       "interval and jumps by centimetres: 33 to 48 mm against 5 mm")
-def test_walking_does_no_harm(walking):
-    assert gain(walking) < 1.5
+def test_walking_leaves_only_the_direction_of_gravity(living):
+    """20 mm at 1.7 Hz: more than 2 m/s² that no motion confirms."""
+    refined = refine(living.shaken_unseen(0.02, 1.7), living.motions)
+    assert refined.scale.policy == "fixed" and refined.scale.log_mean == living.motions.scale_log_mean
+    assert refined.fallback_reason or refined.imu.inflation > 50
+    assert gain(refined) < 1.2
+    assert np.nanmean(nees(refined.trajectory, refined.truth)) < 4
 
 
 # ---- the policy ------------------------------------------------------------------------------
@@ -355,30 +363,49 @@ def test_auto_falls_to_the_filter_and_says_why(short, monkeypatch):
 
 def test_auto_falls_to_the_motions_and_says_why(short, monkeypatch):
     monkeypatch.setattr(GraphEstimator, "estimate", refuse("graph: one"))
-    monkeypatch.setattr("fusion.refine.ekf_estimate", refuse("ekf: two"))
+    monkeypatch.setattr(importlib.import_module("fusion.refine"), "ekf_estimate", refuse("ekf: two"))
     refined = refine(short.recording, short.motions)
     assert (refined.estimator, refined.fallback_reason) == ("motions", "graph: one; ekf: two")
     np.testing.assert_allclose(refined.trajectory.T_world_body, refined.motions_only.T_world_body, atol=1e-12)
     assert refined.scale.policy == "fixed" and len(refined.rejected) == 0
-    sd = np.sqrt((sd_of(refined.trajectory)[:, 3:] ** 2).sum(axis=1))
-    assert (np.diff(sd) > 0).mean() > 0.8 and sd[-1] > 10 * sd[1]  # nothing holds a chain: it only gets worse
-    assert 0.01 < np.nanmean(nees(refined.trajectory, refined.truth)) < 30
+
+
+def test_covariance_of_the_chain_is_that_of_samples(short):
+    """Every motion, the scale and the first tilt drawn from what is claimed about them."""
+    rng, motions, tilt_sd = np.random.default_rng(1), short.motions, 0.02
+    vague = replace(motions, T_i_j=motions.T_i_j @ se3.exp([0, 0, 0.1, 0, 0, 0.01]), cov=9 * motions.cov)
+    twice = joined(motions, vague)  # the surer of two motions of a pair counts, whatever their order
+    first = short.recording.truth.T_world_body[0]
+    estimate = motions_estimate(build_problem(short.recording, twice), twice, first, tilt_sd)
+    lower = np.linalg.cholesky(motions.cov)
+    xi = []
+    for _ in range(1500):
+        T = motions.T_i_j @ se3.exp((lower @ rng.standard_normal((len(motions), 6, 1)))[:, :, 0])
+        T[:, :3, 3] *= np.exp(motions.scale_log_mean + motions.scale_log_sd * rng.standard_normal())
+        body = T_BODY_CAMERA @ T @ se3.inverse(T_BODY_CAMERA)
+        start = se3.transform(se3.so3_exp([*(tilt_sd * rng.standard_normal(2)), 0.0]), np.zeros(3)) @ first
+        start[:3, 3] = first[:3, 3]
+        xi.append(se3.log(se3.inverse(estimate.T_world_body) @ se3.chain(body, start)))
+    sampled = np.einsum("sni,snj->nij", np.array(xi), np.array(xi)) / len(xi)
+    for k in (1, 5, 20, 35):
+        root = np.linalg.inv(np.linalg.cholesky(estimate.cov[k]))
+        np.testing.assert_allclose(np.linalg.eigvalsh(root @ sampled[k] @ root.T), 1.0, atol=0.25)
 
 
 def test_a_forced_graph_that_fails_is_an_error(short, configured, monkeypatch):
     monkeypatch.setattr(GraphEstimator, "estimate", refuse("graph: the cost is nan"))
-    with pytest.raises(EstimationError, match="^graph: the cost is nan$") as caught:
+    with pytest.raises(EstimationError, match=r"^graph: the cost is nan$") as caught:
         refine(short.recording, short.motions, configured(estimator="graph"))
     assert caught.value.exit_code == 4
 
 
 def test_a_forced_filter_that_fails_is_an_error(living, configured):
-    with pytest.raises(EstimationError, match="ekf: .* looked like outliers"):
+    with pytest.raises(EstimationError, match=r"^ekf: .* looked like outliers"):
         refine(living.shaken_unseen(0.02, 1.7), living.motions, configured(estimator="ekf"))
 
 
 @pytest.mark.parametrize(("spoil", "words"), [
-    (lambda e: replace(e, T_world_body=np.where(np.arange(16).reshape(4, 4) == 3, np.nan, e.T_world_body)), "not finite"),
+    (lambda e: replace(e, T_world_body=e.T_world_body * np.nan), "not finite"),
     (lambda e: replace(e, cov=-e.cov), "variance is"),
     (lambda e: replace(e, cov=np.full_like(e.cov, np.inf)), "not finite"),
 ])
