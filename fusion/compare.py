@@ -17,6 +17,8 @@ from vio.trajectory import Trajectory
 
 TITLES = {"none": "none", "origin": "origin", "yaw4": "yaw4", "se3": "SE3", "sim3": "Sim3"}
 VERDICT_ALIGNMENT = "se3"
+TIE = 1e-3
+"""Errors that differ by less than this share are equal: a run that fell back to its motions neither wins nor loses."""
 MOTIONS_ONLY, REFINED = ": motions only", ": refined"
 
 
@@ -68,11 +70,13 @@ def verdict(only: dict[str, Any], refined: dict[str, Any], only_name: str = "mot
     a, b = only[VERDICT_ALIGNMENT], refined[VERDICT_ALIGNMENT]
     if "unavailable" in a or "unavailable" in b:
         return f"{refined_name} against {only_name}: no verdict, {a.get('unavailable') or b.get('unavailable')}"
-    ratio = b["ate_rmse_m"] / max(a["ate_rmse_m"], 1e-300)
-    numbers = f"ATE {1e3 * b['ate_rmse_m']:.2f} mm against {1e3 * a['ate_rmse_m']:.2f} mm, SE3-aligned"
-    if ratio < 1:
-        return f"{refined_name} beats {only_name}: {numbers} ({ratio:.2f} of the error is left)"
-    return f"{refined_name} LOSES to {only_name}: {numbers} ({ratio:.2f} times the error)"
+    left, right = b["ate_rmse_m"], a["ate_rmse_m"]
+    numbers = f"ATE {1e3 * left:.2f} mm against {1e3 * right:.2f} mm, SE3-aligned"
+    if abs(left - right) <= TIE * max(left, right):
+        return f"{refined_name} ties with {only_name}: {numbers}"
+    if left < right:
+        return f"{refined_name} beats {only_name}: {numbers} ({left / right:.2f} of the error is left)"
+    return f"{refined_name} LOSES to {only_name}: {numbers} ({left / max(right, 1e-300):.2f} times the error)"
 
 
 def compare_paths(paths: list[Path], truth_path: Path | None) -> Comparison:

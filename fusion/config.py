@@ -90,7 +90,9 @@ def load_config(path: str | Path) -> RefineConfig:
     path = Path(path)
     try:
         values = yaml.safe_load(path.read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError) as error:
+    except OSError as error:
+        raise ConfigError(f"{path.name}: cannot be read ({error.strerror or error})") from None
+    except UnicodeDecodeError as error:
         raise ConfigError(f"{path.name}: cannot be read ({error})") from None
     except yaml.YAMLError as error:
         raise ConfigError(f"{path.name}: not valid YAML ({str(error).splitlines()[0]})") from None
@@ -134,8 +136,19 @@ def _choice(name: str, value: Any) -> str:
 
 
 def _positive(name: str, value: Any, kind: type) -> int | float:
-    if isinstance(value, bool) or not isinstance(value, (int, float)) or not 0 < value < float("inf"):
+    number = _number(value)
+    if number is None or not 0 < number < float("inf"):
         raise ConfigError(f"configuration: {name} is {value!r}; must be a positive number")
-    if kind is int and int(value) != value:
+    if kind is int and int(number) != number:
         raise ConfigError(f"configuration: {name} is {value!r}; must be a whole number")
-    return int(value) if kind is int else float(value)
+    return int(number) if kind is int else number
+
+
+def _number(value: Any) -> float | None:
+    """A number, or text that is one: YAML 1.1 reads 1e-6 as text."""
+    if isinstance(value, bool) or not isinstance(value, (int, float, str)):
+        return None
+    try:
+        return float(value)
+    except (ValueError, OverflowError):
+        return None

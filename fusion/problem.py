@@ -69,10 +69,11 @@ def build_problem(recording: Recording, motions: RelativeMotions) -> Problem:
     lo, hi = int(i.min()), int(j.max())
     t = recording.frame_t_s[lo:hi + 1]
     imu_t = recording.imu_t_s
-    pieces = split_at_frames(recording.imu, imu_t, t)
     gaps = tuple(find_gaps(imu_t))
     batch = make_motions(i - lo, j - lo, motions.T_i_j, motions.cov, recording.calibration.T_body_camera)
     usable = _usable(t, gaps)
+    gyro_bias = _initial_gyro_bias(split_at_frames(recording.imu, imu_t, t), batch, np.diff(t), usable)
+    pieces = split_at_frames(recording.imu, imu_t, t, gyro_bias)
     noise = recording.calibration.imu_noise
     holes = _hole_inflation(pieces, imu_t)
     clipped = _saturation_inflation(recording, t)
@@ -82,7 +83,7 @@ def build_problem(recording: Recording, motions: RelativeMotions) -> Problem:
         accel_inflation=holes * clipped[1] * accel_inflation, gyro_inflation=holes * clipped[0] * gyro_inflation,
         motions=batch,
         scale_log_mean=motions.scale_log_mean, scale_log_sd=motions.scale_log_sd, noise=noise,
-        gyro_bias_rad_s=_initial_gyro_bias(pieces, batch, np.diff(t), usable),
+        gyro_bias_rad_s=gyro_bias,
     )
 
 

@@ -93,7 +93,8 @@ def read_run(folder: str | Path) -> Run:
         raise FormatError(f"{folder.name}/summary.json: not valid JSON ({error})") from None
     if not isinstance(summary, dict) or summary.get("schema") != 1:
         raise FormatError(f"{folder.name}/summary.json: not a summary of schema 1; write the run again")
-    return Run(folder.name, read_tum(folder / "trajectory.tum"), read_tum(folder / "motions_only.tum"), summary)
+    refined, motions_only = read_tum(folder / "trajectory.tum"), read_tum(folder / "motions_only.tum")
+    return Run(folder.resolve().name, refined, motions_only, summary)
 
 
 def _write_states(r: Refinement, path: Path) -> None:

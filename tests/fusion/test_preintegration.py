@@ -132,7 +132,7 @@ def test_inflation_grows_with_every_level_of_collisions():
     for sensor in (0, 1):
         means = [inflation[sensor].mean() for inflation in levels]
         assert (np.diff(means) > 0.01).all(), means
-    assert levels[5][0].mean() > 2.5
+    assert levels[5][0].mean() > 1.5
 
 
 def test_collisions_are_inflated_where_the_prediction_fails(noiseless):
