@@ -15,7 +15,7 @@ from vio.simulation import T_BODY_CAMERA, NetworkMotions, Simulation, network_li
 NOISELESS = {"noise": ImuNoise(1e-12, 1e-12, 1e-12, 1e-12), "accel_bias_sd_m_s2": 0.0, "gyro_bias_sd_rad_s": 0.0}
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Examination:
     """A simulated recording with the motions a network would report for it."""
 

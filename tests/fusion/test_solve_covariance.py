@@ -33,6 +33,9 @@ class Setup:
     start: gtsam.Values
     segments: int
 
+    def _repr_pretty_(self, printer, _cycle):
+        printer.text("setup")  # or hypothesis prints all arrays with every failure
+
     def cost(self, values, term=None):
         return self.native.error(values) + (term or self.term).cost(values)
 
@@ -74,70 +77,68 @@ def test_no_iteration_raises_the_cost(setup, seed, rotation_rad, huber):
         costs.append(setup.cost(values, term))
     assert (np.diff(costs) <= 0).all(), costs
     if rotation_rad > 0:
-        assert costs[-1] < 0.9 * costs[0]
+        assert costs[-1] < costs[0]
 
 
-def test_every_start_ends_at_the_minimum_that_gtsams_optimiser_finds(setup):
-    """The motions handed to gtsam as numeric callbacks: slow, and nothing of ours in the linearisation."""
-    ours = gauss_newton(setup.native, setup.start, setup.term, 30, 1e-14).values
-    elsewhere = gauss_newton(setup.native, perturbed(setup, 4, 0.1, 0.01), setup.term, 30, 1e-14).values
-    assert setup.cost(elsewhere) == pytest.approx(setup.cost(ours), rel=1e-9)
+@pytest.mark.parametrize("loss", ["gaussian", "huber", "gated"])
+def test_every_start_ends_at_the_minimum_that_gtsams_optimiser_finds(setup, loss):
+    """The motions handed to gtsam as numeric callbacks: slow, and nothing of ours in residual or linearisation."""
+    motions = setup.problem.motions
+    t = motions.t.copy()
+    t[[5, 17, 30]] += 0.02  # outliers, or no loss would differ from another
+    weight = np.ones(len(t))
+    if loss == "gated":
+        weight[[5, 17, 30]] = 1e-4
+    term = replace(setup.term, motions=replace(motions, t=t), huber=2.8 if loss == "huber" else None, weight=weight)
+    ours = gauss_newton(setup.native, setup.start, term, 60, 1e-14).values
+    elsewhere = gauss_newton(setup.native, perturbed(setup, 4, 0.1, 0.01), term, 60, 1e-14).values
+    assert setup.cost(elsewhere, term) == pytest.approx(setup.cost(ours, term), rel=1e-8)
 
     graph = gtsam.NonlinearFactorGraph(setup.native)
-    for n, segment in enumerate(setup.term.segment):
-        one = replace(setup.term, motions=setup.problem.motions.select(np.array([n])),
-                      segment=np.zeros(1, np.int64), weight=np.ones(1))
-        graph.add(_callback_factor(one, int(segment)))
+    for n in range(len(t)):
+        noise = gtsam.noiseModel.Isotropic.Sigma(6, 1 / np.sqrt(weight[n]))
+        if loss == "huber":
+            noise = gtsam.noiseModel.Robust.Create(gtsam.noiseModel.mEstimator.Huber.Create(2.8), noise)
+        graph.add(_callback_factor(term.motions, n, int(term.segment[n]), noise))
+    assert graph.error(ours) == pytest.approx(setup.cost(ours, term), rel=1e-9)
     params = gtsam.LevenbergMarquardtParams()
     params.setRelativeErrorTol(1e-12)
     params.setAbsoluteErrorTol(1e-12)
     theirs = gtsam.LevenbergMarquardtOptimizer(graph, setup.start, params).optimize()
-    assert setup.cost(ours) == pytest.approx(graph.error(theirs), rel=1e-7)
-    assert setup.cost(ours) < setup.cost(setup.start)
+    assert setup.cost(ours, term) == pytest.approx(graph.error(theirs), rel=1e-6)
+    assert setup.cost(ours, term) < setup.cost(setup.start, term)
     a, b = (read_states(values, 0, len(setup.problem)) for values in (ours, theirs))
-    np.testing.assert_allclose(a.p, b.p, atol=1e-5)
-    np.testing.assert_allclose(a.R, b.R, atol=1e-5)
-    np.testing.assert_allclose(read_log_scales(ours, 2), read_log_scales(theirs, 2), atol=1e-3)
+    np.testing.assert_allclose(a.p, b.p, atol=3e-5)
+    np.testing.assert_allclose(a.R, b.R, atol=3e-5)
+    np.testing.assert_allclose(read_log_scales(ours, 2), read_log_scales(theirs, 2), atol=2e-3)
 
 
-def _callback_factor(one, segment):
-    i, j = int(one.motions.i[0]), int(one.motions.j[0])
-    keys = [X(i), X(j), S(segment)]
-    pair = replace(one, motions=replace(one.motions, i=np.array([0]), j=np.array([1])))
+def _callback_factor(motions, n, segment, noise):
+    """Motion n in gtsam's own types, with numeric derivatives."""
+    T_bc = gtsam.Pose3(motions.T_body_camera)
+    measured, h = gtsam.Rot3(motions.R[n]), 1e-6
 
-    def residual(poses, log_scale):
-        values = gtsam.Values()
-        values.insert(X(0), poses[0])
-        values.insert(X(1), poses[1])
-        values.insert(S(0), log_scale)
-        R = np.array([pose.rotation().matrix() for pose in poses])
-        p = np.array([pose.translation() for pose in poses])
-        motions, s = pair.motions, log_scale
-        T_bc = gtsam.Pose3(motions.T_body_camera)
-        pred = T_bc.inverse() * gtsam.Pose3(gtsam.Rot3(R[0]), p[0]).between(gtsam.Pose3(gtsam.Rot3(R[1]), p[1])) * T_bc
-        turn = gtsam.Rot3(motions.R[0]).between(pred.rotation())
-        e_t = motions.R[0].T @ (np.exp(-s) * pred.translation() - motions.t[0])
-        return motions.whiten[0] @ np.r_[gtsam.Rot3.Logmap(turn), e_t]
+    def residual(first, second, log_scale):
+        camera = T_bc.inverse() * first.between(second) * T_bc
+        e_t = measured.unrotate(np.exp(-log_scale) * camera.translation() - motions.t[n])
+        return motions.whiten[n] @ np.r_[gtsam.Rot3.Logmap(measured.between(camera.rotation())), e_t]
 
-    def error(_, values, jacobians):
-        poses, s = [values.atPose3(keys[0]), values.atPose3(keys[1])], values.atDouble(keys[2])
-        r, h = residual(poses, s), 1e-6
+    def slope(moved):
+        return (moved(h) - moved(-h)) / (2 * h)
+
+    def error(factor, values, jacobians):
+        i, j, s = factor.keys()
+        first, second, log_scale = values.atPose3(i), values.atPose3(j), values.atDouble(s)
         if jacobians is not None:
-            for which in (0, 1):
-                columns = []
-                for axis in range(6):
-                    moved = []
-                    for sign in (h, -h):
-                        xi = np.zeros(6)
-                        xi[axis] = sign
-                        moved.append(residual([pose.retract(xi) if k == which else pose
-                                               for k, pose in enumerate(poses)], s))
-                    columns.append((moved[0] - moved[1]) / (2 * h))
-                jacobians[which] = np.array(columns, order="F").T
-            jacobians[2] = ((residual(poses, s + h) - residual(poses, s - h)) / (2 * h))[:, None]
-        return r
+            axes = np.eye(6)
+            jacobians[0] = np.array([slope(lambda d, e=e: residual(first.retract(d * e), second, log_scale))
+                                     for e in axes]).T.copy(order="F")
+            jacobians[1] = np.array([slope(lambda d, e=e: residual(first, second.retract(d * e), log_scale))
+                                     for e in axes]).T.copy(order="F")
+            jacobians[2] = slope(lambda d: residual(first, second, log_scale + d))[:, None]
+        return residual(first, second, log_scale)
 
-    return gtsam.CustomFactor(gtsam.noiseModel.Unit.Create(6), keys, error)
+    return gtsam.CustomFactor(noise, [X(int(motions.i[n])), X(int(motions.j[n])), S(segment)], error)
 
 
 def test_marginals_equal_the_dense_inverse_and_gtsams(setup):
@@ -224,9 +225,12 @@ def test_chunks_lead_to_the_optimum_of_the_whole(long):
     add_anchor(native, 0, whole.anchor)
     add_imu(native, whole.measurements, problem)
     term = MotionTerm(problem.motions, None, problem.scale_log_mean, 2.8, np.ones(len(problem.motions)))
+    begun = read_states(chunked.values, 0, len(problem))
     a, b = (read_states(gauss_newton(native, start.values, term, 25, 1e-13).values, 0, len(problem))
             for start in (chunked, whole))
     assert not np.array_equal(a.p, b.p)  # or it was no test
+    np.testing.assert_allclose(begun.p, b.p, atol=5e-3)  # chunk continues where the one before it was cut
+    np.testing.assert_allclose(begun.R, b.R, atol=0.02)
     np.testing.assert_allclose(a.p, b.p, atol=1e-6)
     np.testing.assert_allclose(a.R, b.R, atol=1e-6)
     biases = np.array([start.measurements[400].biasHat().vector() for start in (chunked, whole)])
