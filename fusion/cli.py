@@ -13,6 +13,8 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any
 
+from tqdm import tqdm
+
 from fusion.cli_parser import build_parser
 from vio.errors import UsageError, VioError
 
@@ -34,8 +36,32 @@ def main(argv: Sequence[str] | None = None) -> int:
         return 130
 
 
-def _announce(text: str) -> None:
-    print(f"… {text.replace('_', ' ')}", file=sys.stderr, flush=True)
+class _Progress:
+    """Stages on stderr: a line that rewrites itself on a terminal, plain lines otherwise."""
+
+    def __init__(self) -> None:
+        self.bar = tqdm(bar_format="{desc} {elapsed}", leave=False, disable=not sys.stderr.isatty())
+
+    def __enter__(self) -> _Progress:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self.bar.close()
+
+    def __call__(self, stage: str) -> None:
+        """Announce a stage."""
+        text = f"… {stage.replace('_', ' ')}"
+        if self.bar.disable:
+            print(text, file=sys.stderr, flush=True)
+        else:
+            self.bar.set_description_str(text)
+
+    def count(self, done: int, total: int) -> None:
+        """Announce how much of a known total is done, in steps of a tenth where lines are plain."""
+        if not self.bar.disable:
+            self.bar.set_description_str(f"… {done} of {total}")
+        elif done * 10 // total != (done - 1) * 10 // total:
+            self(f"{done} of {total}")
 
 
 def _print_json(value: Any) -> None:
@@ -46,7 +72,8 @@ def _demo(arguments: argparse.Namespace) -> int:
     from fusion.compare import format_table
     from fusion.demo import run_demo
 
-    demo = run_demo(arguments.out, arguments.seed, _announce)
+    with _Progress() as progress:
+        demo = run_demo(arguments.out, arguments.seed, progress)
     if arguments.json:
         _print_json(demo.comparison.to_dict())
         return 0
@@ -110,7 +137,8 @@ def _predict(arguments: argparse.Namespace) -> int:
     else:
         import learned
 
-        motions = learned.predict(recording, arguments.weights, depth_dir=arguments.depth)
+        with _Progress() as progress:
+            motions = learned.predict(recording, arguments.weights, depth_dir=arguments.depth, progress=progress.count)
     motions.save(arguments.out)
     print(f"{arguments.out}: {len(motions)} motions")
     return 0
@@ -136,7 +164,8 @@ def _refine(arguments: argparse.Namespace) -> int:
         import learned
 
         motions = learned.predict(recording, arguments.weights)
-    refined = refine(recording, motions, config, _announce)
+    with _Progress() as progress:
+        refined = refine(recording, motions, config, progress)
     command = ["refine", arguments.recording.name, "--out", arguments.out.name]
     summary = write_run(refined, arguments.out, Provenance(command, config, inputs), motions)
     if arguments.json:

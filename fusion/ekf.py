@@ -161,7 +161,7 @@ def ekf_estimate(problem: Problem, R_world_body_first: Array, initial: InitialCo
     Raises:
         EstimationError: no motion joins neighbours, most looked like outliers, or the state stopped being finite.
     """
-    motion_of = _consecutive_motions(problem)
+    motion_of = problem.motions.surest_neighbours(len(problem))
     updates = int((motion_of >= 0).sum())
     if updates == 0:
         raise EstimationError("ekf: no motion joins two neighbouring frames, and the filter uses no others")
@@ -187,13 +187,3 @@ def ekf_estimate(problem: Problem, R_world_body_first: Array, initial: InitialCo
     cov = add_scale_uncertainty(T, cov, sd, problem.motions.T_body_camera)
     return Estimate(T, cov, v, gyro_bias, accel_bias, np.full(m, mean), np.full(m, sd), conclusion,
                     np.array(outliers, np.int64))
-
-
-def _consecutive_motions(problem: Problem) -> NDArray[np.int64]:
-    """(M-1,) the surest motion of every neighbouring pair, -1 where there is none."""
-    out = np.full(len(problem) - 1, -1, np.int64)
-    certainty = np.trace(problem.motions.whiten, axis1=1, axis2=2)
-    for n in np.argsort(certainty, kind="stable"):
-        if problem.motions.j[n] - problem.motions.i[n] == 1:
-            out[problem.motions.i[n]] = n
-    return out

@@ -81,12 +81,11 @@ def _propagate(problem: Problem, T: Array, tilt_sd_rad: float) -> Array:
     Q = np.zeros((m - 1, 6, 6))
     Q[:] = np.diag([0.5**2] * 3 + [0.05**2] * 3)  # a pair no motion measured
     motions, scale = problem.motions, np.exp(problem.scale_log_mean)
-    consecutive = np.flatnonzero(motions.j - motions.i == 1)
-    lower = np.linalg.inv(motions.whiten[consecutive])
-    measured = lower @ np.swapaxes(lower, 1, 2)
-    order = np.argsort(-np.trace(measured, axis1=1, axis2=2), kind="stable")  # the surest last, as `chain_motions` does
+    surest = motions.surest_neighbours(m)
+    measured = surest >= 0
+    lower = np.linalg.inv(motions.whiten[surest[measured]])
     to_body = se3.adjoint(motions.T_body_camera) @ np.diag([1.0] * 3 + [scale] * 3)
-    Q[motions.i[consecutive[order]]] = to_body @ measured[order] @ to_body.T
+    Q[measured] = to_body @ lower @ np.swapaxes(lower, 1, 2) @ to_body.T
     back = se3.adjoint(se3.inverse(se3.inverse(T[:-1]) @ T[1:]))
     cov = np.zeros((m, 6, 6))
     R0 = T[0, :3, :3]

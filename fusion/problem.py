@@ -113,11 +113,11 @@ def _saturation_inflation(recording: Recording, t: Array) -> tuple[Array, Array]
 
 def _initial_gyro_bias(pieces: ImuPieces, motions: ScaledMotions, dt: Array, usable: NDArray[np.bool_]) -> Array:
     """Median of `Log(R_measᵀ R_gyro) / dt` over consecutive motions: robust, needs no graph."""
-    use = np.flatnonzero((motions.j - motions.i == 1) & usable[motions.i])[:BIAS_FRAMES]
-    if len(use) == 0:
+    surest = motions.surest_neighbours(len(dt) + 1)
+    k = np.flatnonzero((surest >= 0) & usable)[:BIAS_FRAMES]
+    if len(k) == 0:
         return np.zeros(3)
-    k = motions.i[use]
     gyro = preintegrate_rotation(pieces, np.zeros(3))[k]
-    off = se3.so3_log(np.swapaxes(motions.select(use).body_rotation(), 1, 2) @ gyro)
+    off = se3.so3_log(np.swapaxes(motions.select(surest[k]).body_rotation(), 1, 2) @ gyro)
     bias: Array = np.median(off / dt[k, None], axis=0)
     return bias

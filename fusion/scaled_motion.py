@@ -50,6 +50,15 @@ class ScaledMotions:
         return ScaledMotions(self.i[index] - first_node, self.j[index] - first_node, self.R[index], self.t[index],
                              self.whiten[index], self.T_body_camera)
 
+    def surest_neighbours(self, nodes: int) -> NDArray[np.int64]:
+        """(nodes-1,) the surest motion from every node to the next, -1 where none is: the choice of `chain_motions`."""
+        variance = np.square(np.linalg.inv(self.whiten)).sum(axis=(1, 2))  # trace of the covariance
+        order = np.argsort(-variance, kind="stable")
+        order = order[(self.j - self.i)[order] == 1]
+        surest = np.full(nodes - 1, -1, np.int64)
+        surest[self.i[order]] = order
+        return surest
+
     def body_rotation(self) -> Array:
         """(N, 3, 3) measured rotation of body j in body i."""
         R_bc = self.T_body_camera[:3, :3]

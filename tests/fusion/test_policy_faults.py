@@ -1,20 +1,24 @@
-"""Inputs that cannot be used: each is refused with exactly one line that says what, where and what to do."""
+"""What is refused, with exactly one line that says what, where and what to do; and what is done when a solver fails."""
 
+import importlib
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
 
-from fusion import refine
+from fusion import RefineConfig, refine
+from fusion.estimate import motions_estimate
+from fusion.graph_estimator import GraphEstimator
 from fusion.problem import build_problem
+from vio import se3
 from vio.calibration import Calibration
-from vio.errors import GeometryError, ImuError, MotionsError, RecordingError, VioError
+from vio.errors import EstimationError, GeometryError, ImuError, MotionsError, RecordingError, VioError
 from vio.imu import ImuSamples
 from vio.metrics import ate
 from vio.motions import RelativeMotions, load_motions
 from vio.recording import Recording
-from vio.simulation import SIMULATED_IMU
+from vio.simulation import SIMULATED_IMU, T_BODY_CAMERA
 
 
 @dataclass
@@ -192,3 +196,95 @@ def test_motions_survive_their_file(short, tmp_path):
     again = load_motions(tmp_path / "motions.npz")
     a, b = (refine(short.recording, motions) for motions in (short.motions, again))
     np.testing.assert_allclose(a.trajectory.T_world_body, b.trajectory.T_world_body, atol=1e-9)
+
+
+# ---- the policy ------------------------------------------------------------------------------
+
+def refuse(message):
+    def estimate(*_args, **_kwargs):
+        raise EstimationError(message)
+
+    return estimate
+
+
+def test_forced_ekf_has_no_reason_to_explain(short, configured):
+    refined = refine(short.recording, short.motions, configured(estimator="ekf"))
+    assert refined.estimator == "ekf" and refined.fallback_reason is None
+    assert refined.imu.chi2_per_dof is None
+
+
+def test_auto_falls_to_the_filter_and_says_why(short, monkeypatch):
+    monkeypatch.setattr(GraphEstimator, "estimate", refuse("graph: the cost is nan"))
+    refined = refine(short.recording, short.motions)
+    assert (refined.estimator, refined.fallback_reason) == ("ekf", "graph: the cost is nan")
+    forced = refine(short.recording, short.motions, RefineConfig(estimator="ekf"))
+    np.testing.assert_array_equal(refined.trajectory.T_world_body, forced.trajectory.T_world_body)
+
+
+def test_auto_falls_to_the_motions_and_says_why(short, monkeypatch):
+    monkeypatch.setattr(GraphEstimator, "estimate", refuse("graph: one"))
+    monkeypatch.setattr(importlib.import_module("fusion.refine"), "ekf_estimate", refuse("ekf: two"))
+    refined = refine(short.recording, short.motions)
+    assert (refined.estimator, refined.fallback_reason) == ("motions", "graph: one; ekf: two")
+    np.testing.assert_allclose(refined.trajectory.T_world_body, refined.motions_only.T_world_body, atol=1e-12)
+    assert refined.scale.policy == "fixed" and len(refined.rejected) == 0
+
+
+def test_covariance_of_the_chain_is_that_of_samples(short):
+    """Every motion, the scale and the first tilt drawn from what is claimed about them."""
+    rng, motions, tilt_sd = np.random.default_rng(1), short.motions, 0.02
+    vague = replace(motions, T_i_j=motions.T_i_j @ se3.exp([0, 0, 0.1, 0, 0, 0.01]), cov=9 * motions.cov)
+    twice = RelativeMotions(*(np.concatenate([getattr(m, name) for m in (motions, vague)])
+                              for name in ("t_i_s", "t_j_s", "T_i_j", "cov")), motions.scale_log_mean,
+                            motions.scale_log_sd)  # the surer of two motions of a pair counts, whatever their order
+    first = short.recording.truth.T_world_body[0]
+    estimate = motions_estimate(build_problem(short.recording, twice), twice, first, tilt_sd)
+    lower = np.linalg.cholesky(motions.cov)
+    xi = []
+    for _ in range(1500):
+        T = motions.T_i_j @ se3.exp((lower @ rng.standard_normal((len(motions), 6, 1)))[:, :, 0])
+        T[:, :3, 3] *= np.exp(motions.scale_log_mean + motions.scale_log_sd * rng.standard_normal())
+        body = T_BODY_CAMERA @ T @ se3.inverse(T_BODY_CAMERA)
+        start = se3.transform(se3.so3_exp([*(tilt_sd * rng.standard_normal(2)), 0.0]), np.zeros(3)) @ first
+        start[:3, 3] = first[:3, 3]
+        xi.append(se3.log(se3.inverse(estimate.T_world_body) @ se3.chain(body, start)))
+    sampled = np.einsum("sni,snj->nij", np.array(xi), np.array(xi)) / len(xi)
+    for k in (1, 5, 20, 35):
+        root = np.linalg.inv(np.linalg.cholesky(estimate.cov[k]))
+        np.testing.assert_allclose(np.linalg.eigvalsh(root @ sampled[k] @ root.T), 1.0, atol=0.25)
+
+
+def test_a_forced_graph_that_fails_is_an_error(short, configured, monkeypatch):
+    monkeypatch.setattr(GraphEstimator, "estimate", refuse("graph: the cost is nan"))
+    with pytest.raises(EstimationError, match=r"^graph: the cost is nan$") as caught:
+        refine(short.recording, short.motions, configured(estimator="graph"))
+    assert caught.value.exit_code == 4
+
+
+def test_a_forced_filter_that_fails_is_an_error(examination, configured):
+    with pytest.raises(EstimationError, match=r"^ekf: .* looked like outliers"):
+        refine(examination.shaken_unseen(0.02, 1.7), examination.motions, configured(estimator="ekf"))
+
+
+@pytest.mark.parametrize(("spoil", "words"), [
+    (lambda e: replace(e, T_world_body=e.T_world_body * np.nan), "not finite"),
+    (lambda e: replace(e, cov=-e.cov), "variance is"),
+    (lambda e: replace(e, cov=np.full_like(e.cov, np.inf)), "not finite"),
+])
+def test_numbers_that_are_no_answer_are_stepped_over(short, monkeypatch, spoil, words):
+    estimate = GraphEstimator.estimate
+    monkeypatch.setattr(GraphEstimator, "estimate", lambda self: spoil(estimate(self)))
+    refined = refine(short.recording, short.motions)
+    assert refined.estimator == "ekf"
+    assert refined.fallback_reason.startswith("graph: ") and words in refined.fallback_reason
+
+
+def test_without_any_usable_imu_the_motions_still_lead(examination):
+    """A sample every 1.1 s leaves a gap in every frame interval: the graph says so, the filter coasts on motions."""
+    every = np.arange(0, len(examination.recording.imu), 45)
+    sparse = examination.with_samples(every)
+    assert not build_problem(sparse, examination.motions).imu_usable.any()
+    refined = refine(sparse, examination.motions)
+    assert refined.estimator in ("ekf", "motions")
+    assert refined.fallback_reason.startswith("graph: no frame interval has usable IMU data")
+    assert ate(refined.trajectory, refined.truth).rmse_m < 1.5 * ate(refined.motions_only, refined.truth).rmse_m

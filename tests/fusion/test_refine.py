@@ -1,6 +1,5 @@
 """The whole estimate on simulated examinations: what it gains, what it survives, and what it admits."""
 
-import importlib
 from dataclasses import replace
 
 import numpy as np
@@ -8,9 +7,6 @@ import pytest
 
 from fusion import RefineConfig, refine
 from fusion.config import ScaleConfig
-from fusion.estimate import motions_estimate
-from fusion.graph_estimator import GraphEstimator
-from fusion.problem import build_problem
 from vio import se3
 from vio.consistency import coverage, fix_gauge, nees
 from vio.errors import EstimationError
@@ -164,7 +160,8 @@ def test_half_an_hour_at_rest_stays_where_it_is(examine):
     still = examine("small-bowel", "none", 0, 1800.0, 311, mode="rest", frame_rate_hz=0.5)
     refined = refine(still.recording, still.motions)
     assert refined.estimator == "graph" and len(refined.trajectory) == 900
-    assert refined.scale.policy == "prior"
+    assert refined.scale.policy == "prior" and "hardly moved" in refined.scale.reason
+    assert refined.scale.log_mean == still.motions.scale_log_mean
     # A chain of 900 motions with 0.05 mm of noise per axis, a lever arm and 18 outliers wanders 8 mm.
     off = refined.trajectory.positions_m
     assert np.abs(off).max() < 0.04
@@ -304,8 +301,9 @@ def test_a_policy_that_was_asked_for_is_followed(examination, configured, policy
     assert gain(refined) < 0.8
 
 
-@pytest.mark.parametrize(("off", "sd"), [(1.0, 1.0), (-1.5, 1.5), (0.5, 3.0)])
+@pytest.mark.parametrize(("off", "sd"), [(1.0, 1.0), (-4.0, 2.0)])
 def test_a_vague_prior_is_searched(examination, off, sd):
+    """From a scale 50 times too small Gauss-Newton alone does not find home."""
     vague = replace(examination.motions, scale_log_mean=examination.motions.scale_log_mean + off, scale_log_sd=sd)
     refined = refine(examination.recording, vague)
     assert refined.scale.policy == "free"
@@ -336,93 +334,3 @@ def test_walking_leaves_only_the_direction_of_gravity(living):
     assert refined.fallback_reason or refined.imu.inflation > 50
     assert gain(refined) < 1.2
     assert np.nanmean(nees(refined.trajectory, refined.truth)) < 4
-
-
-# ---- the policy ------------------------------------------------------------------------------
-
-def refuse(message):
-    def estimate(*_args, **_kwargs):
-        raise EstimationError(message)
-
-    return estimate
-
-
-def test_forced_ekf_has_no_reason_to_explain(short, configured):
-    refined = refine(short.recording, short.motions, configured(estimator="ekf"))
-    assert refined.estimator == "ekf" and refined.fallback_reason is None
-    assert refined.imu.chi2_per_dof is None
-
-
-def test_auto_falls_to_the_filter_and_says_why(short, monkeypatch):
-    monkeypatch.setattr(GraphEstimator, "estimate", refuse("graph: the cost is nan"))
-    refined = refine(short.recording, short.motions)
-    assert (refined.estimator, refined.fallback_reason) == ("ekf", "graph: the cost is nan")
-    forced = refine(short.recording, short.motions, RefineConfig(estimator="ekf"))
-    np.testing.assert_array_equal(refined.trajectory.T_world_body, forced.trajectory.T_world_body)
-
-
-def test_auto_falls_to_the_motions_and_says_why(short, monkeypatch):
-    monkeypatch.setattr(GraphEstimator, "estimate", refuse("graph: one"))
-    monkeypatch.setattr(importlib.import_module("fusion.refine"), "ekf_estimate", refuse("ekf: two"))
-    refined = refine(short.recording, short.motions)
-    assert (refined.estimator, refined.fallback_reason) == ("motions", "graph: one; ekf: two")
-    np.testing.assert_allclose(refined.trajectory.T_world_body, refined.motions_only.T_world_body, atol=1e-12)
-    assert refined.scale.policy == "fixed" and len(refined.rejected) == 0
-
-
-def test_covariance_of_the_chain_is_that_of_samples(short):
-    """Every motion, the scale and the first tilt drawn from what is claimed about them."""
-    rng, motions, tilt_sd = np.random.default_rng(1), short.motions, 0.02
-    vague = replace(motions, T_i_j=motions.T_i_j @ se3.exp([0, 0, 0.1, 0, 0, 0.01]), cov=9 * motions.cov)
-    twice = joined(motions, vague)  # the surer of two motions of a pair counts, whatever their order
-    first = short.recording.truth.T_world_body[0]
-    estimate = motions_estimate(build_problem(short.recording, twice), twice, first, tilt_sd)
-    lower = np.linalg.cholesky(motions.cov)
-    xi = []
-    for _ in range(1500):
-        T = motions.T_i_j @ se3.exp((lower @ rng.standard_normal((len(motions), 6, 1)))[:, :, 0])
-        T[:, :3, 3] *= np.exp(motions.scale_log_mean + motions.scale_log_sd * rng.standard_normal())
-        body = T_BODY_CAMERA @ T @ se3.inverse(T_BODY_CAMERA)
-        start = se3.transform(se3.so3_exp([*(tilt_sd * rng.standard_normal(2)), 0.0]), np.zeros(3)) @ first
-        start[:3, 3] = first[:3, 3]
-        xi.append(se3.log(se3.inverse(estimate.T_world_body) @ se3.chain(body, start)))
-    sampled = np.einsum("sni,snj->nij", np.array(xi), np.array(xi)) / len(xi)
-    for k in (1, 5, 20, 35):
-        root = np.linalg.inv(np.linalg.cholesky(estimate.cov[k]))
-        np.testing.assert_allclose(np.linalg.eigvalsh(root @ sampled[k] @ root.T), 1.0, atol=0.25)
-
-
-def test_a_forced_graph_that_fails_is_an_error(short, configured, monkeypatch):
-    monkeypatch.setattr(GraphEstimator, "estimate", refuse("graph: the cost is nan"))
-    with pytest.raises(EstimationError, match=r"^graph: the cost is nan$") as caught:
-        refine(short.recording, short.motions, configured(estimator="graph"))
-    assert caught.value.exit_code == 4
-
-
-def test_a_forced_filter_that_fails_is_an_error(living, configured):
-    with pytest.raises(EstimationError, match=r"^ekf: .* looked like outliers"):
-        refine(living.shaken_unseen(0.02, 1.7), living.motions, configured(estimator="ekf"))
-
-
-@pytest.mark.parametrize(("spoil", "words"), [
-    (lambda e: replace(e, T_world_body=e.T_world_body * np.nan), "not finite"),
-    (lambda e: replace(e, cov=-e.cov), "variance is"),
-    (lambda e: replace(e, cov=np.full_like(e.cov, np.inf)), "not finite"),
-])
-def test_numbers_that_are_no_answer_are_stepped_over(short, monkeypatch, spoil, words):
-    estimate = GraphEstimator.estimate
-    monkeypatch.setattr(GraphEstimator, "estimate", lambda self: spoil(estimate(self)))
-    refined = refine(short.recording, short.motions)
-    assert refined.estimator == "ekf"
-    assert refined.fallback_reason.startswith("graph: ") and words in refined.fallback_reason
-
-
-def test_without_any_usable_imu_the_motions_still_lead(examination):
-    """A sample every 1.1 s leaves a gap in every frame interval: the graph says so, the filter coasts on motions."""
-    every = np.arange(0, len(examination.recording.imu), 45)
-    sparse = examination.with_samples(every)
-    assert not build_problem(sparse, examination.motions).imu_usable.any()
-    refined = refine(sparse, examination.motions)
-    assert refined.estimator in ("ekf", "motions")
-    assert refined.fallback_reason.startswith("graph: no frame interval has usable IMU data")
-    assert gain(refined) < 1.5
