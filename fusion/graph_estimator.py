@@ -123,7 +123,7 @@ class GraphEstimator:
             with self.stages("accelerometer_down_weighted"):
                 start = self._start(start_scale, inflation)
                 fixed = self._fixed_pass(start, start_scale)
-            if fixed.imu_chi2 > self.config.scale.imu_chi2_limit:
+            if fixed.imu_chi2 > scale_policy.CALM_CHI2:
                 continue
             final, free = self._free_pass(start, fixed, start_scale)
             if scale_policy.reasons_against(free, self.problem, self.config.scale) is None:

@@ -23,7 +23,9 @@ INFORMATIVE = 0.5
 """The freed scale's sd must be below this share of the prior's to count as measured."""
 LEAST_SIGNAL = 1.5
 """Steps over noise below which noise alone would pass for a larger scale: nothing is measured then."""
-INFLATION_LADDER = (3.0, 10.0, 50.0)
+CALM_CHI2 = 0.75
+"""Inertial chi² that a down-weighted accelerometer must reach: a little above the clean value."""
+INFLATION_LADDER = (3.0, 10.0)
 """Factors on the accelerometer density that are tried when the IMU disagrees with the motions."""
 GRAVITY_ONLY = 2500.0
 """Factor that leaves the accelerometer nothing but the mean direction of gravity."""

@@ -34,13 +34,17 @@ class MapSettings:
     hop: int = 4
     """New frames between adjustments."""
     start_parallax_deg: float = 2.0
-    """Median parallax between the two views a map starts from."""
-    point_parallax_deg: float = 1.0
+    """Median parallax that is enough for the two views a map starts from."""
+    least_parallax_deg: float = 0.5
+    """Median parallax they must have where tracks end before it is enough."""
+    point_parallax_deg: float = 0.5
     """Parallax from which a point may place a new camera."""
-    min_common: int = 10
+    min_common: int = 8
     """Tracks that two views must share to start a map."""
     min_points: int = 6
-    """Points that must agree on a new pose."""
+    """Tracks that must agree on a new pose."""
+    min_known: int = 4
+    """Of these, those with parallax of their own."""
     threshold_px: float = 3.0
     """Residual at which a track counts as wrong while a pose is searched; later weights are soft."""
     max_start_frames: int = 120
@@ -81,20 +85,22 @@ class Map:
 
     def find_start(self, first: int) -> tuple[int, int, Array] | None:
         """The earliest two views from `first` on that show parallax, and the pose of the second in the first."""
-        s = self.settings
-        a = first
+        s, a = self.settings, first
         while a < len(self.T) - 1:
-            b = a + 1
-            while b < min(len(self.T), a + s.max_start_frames + 1):
+            best, best_parallax = a, np.radians(s.least_parallax_deg)
+            for b in range(a + 1, min(len(self.T), a + s.max_start_frames + 1)):
                 i, j = self.common(a, b)
-                if len(i) < s.min_common:
+                if len(i) < s.min_common or best_parallax >= np.radians(s.start_parallax_deg):
                     break
-                if parallax(self.rays.bearing[i], self.rays.bearing[j]) > np.radians(s.start_parallax_deg):
-                    view = relative_pose(self.rays.select(i), self.rays.select(j), s.threshold_px, self.rng)
-                    if view is not None and view.inlier.sum() >= max(s.min_common - 2, 0.6 * len(i)):
-                        return a, b, view.T_1_2
-                b += 1
-            a += max(1, (b - a) // 4)
+                angle = parallax(self.rays.bearing[i], self.rays.bearing[j])
+                if angle > best_parallax:
+                    best, best_parallax = b, angle
+            if best > a:
+                i, j = self.common(a, best)
+                view = relative_pose(self.rays.select(i), self.rays.select(j), s.threshold_px, self.rng)
+                if view is not None and view.inlier.sum() >= max(s.min_common - 2, 0.6 * len(i)):
+                    return a, best, view.T_1_2
+            a += 1
         return None
 
     def start(self, a: int, b: int, T_a_b: Array, back_to: int) -> Adjustment:
@@ -112,22 +118,24 @@ class Map:
                 break
         s = int(np.flatnonzero(self.segment == segment).min())
         for _ in range(3):
-            done = self.adjust_window(s, b + 1, held=1)
+            done = self.adjust_window(s, b + 1, held=1, iterations=15)
         return done
 
     def place(self, k: int, neighbour: int) -> bool:
         """Find the pose of frame k from points in the map, starting from the neighbour's pose and motion."""
         s, rows = self.settings, np.arange(self.begin[k], self.begin[k + 1])
-        rows = rows[self.known[self.track[rows]]]
-        if len(rows) < s.min_points:
-            return False
-        points, rays = self.points[self.track[rows]], self.rays.select(rows)
-        found = find_pose(points, rays, s.threshold_px, self.rng, self._guesses(k, neighbour))
-        if found is None or found[1].sum() < max(s.min_points, 0.4 * len(rows)):
+        rows = rows[np.isfinite(self.points[self.track[rows], 0])]
+        points, rays, usable = self.points[self.track[rows]], self.rays.select(rows), self.known[self.track[rows]]
+        found = find_pose(points, rays, usable, s.threshold_px, self.rng, self._guesses(k, neighbour))
+        if found is None:
             return False
         offset = self._expected_residual(rows, neighbour) if self.segment[neighbour] >= 0 else np.zeros((len(rows), 2))
-        self.T[k] = refine_pose(found[0], points, rays, self.noise, offset)
-        self.segment[k] = self.segment.max()
+        T = refine_pose(found[0], points, rays, self.noise, offset)
+        miss = direction_residuals(np.broadcast_to(T, (len(rows), 4, 4)), points, rays)[0] - offset
+        agree = np.linalg.norm(miss, axis=1) < s.threshold_px
+        if agree.sum() < max(s.min_points, 0.5 * len(rows)) or (agree & usable).sum() < s.min_known:
+            return False
+        self.T[k], self.segment[k] = T, self.segment.max()
         return True
 
     def _guesses(self, k: int, neighbour: int) -> Array | None:
@@ -181,7 +189,7 @@ class Map:
         rows = rows[count[inverse] >= 2]
         return rows, self.frame[rows], self.track[rows]
 
-    def adjust_window(self, s: int, e: int, held: int) -> tuple[Ints, Adjustment]:
+    def adjust_window(self, s: int, e: int, held: int, iterations: int = 6) -> tuple[Ints, Adjustment]:
         """Bundle adjustment of the placed frames s..e-1, the first `held` of them fixed, and a new noise estimate.
 
         Returns:
@@ -197,7 +205,7 @@ class Map:
         points /= np.linalg.norm(points, axis=1, keepdims=True)
         window = Window(se3.inverse(T_ref) @ self.T[frames], points, np.searchsorted(frames, pose), point,
                         self.rays.select(rows), fixed)
-        done = adjust(window, self.noise)
+        done = adjust(window, self.noise, iterations)
         self.noise = fit_noise(done.residual, window.starts, window.unknowns)
         self.T[frames[~fixed]] = T_ref @ done.window.T_world_camera[~fixed]
         self.points[ids] = done.window.points @ T_ref.T

@@ -73,7 +73,8 @@ def run_map(tracks, camera, pairs, settings):
             m.triangulate(max(seg0, k - settings.window), k + 1)
             new += 1
             k += 1
-            if new >= settings.hop or k == tracks.n_frames:
+            few = m.known[m.track[m.seen(k-1)]].sum() < 3 * settings.min_points
+            if new >= settings.hop or few or k == tracks.n_frames:
                 w0 = max(seg0, k - settings.window)
                 frames, done = m.adjust_window(w0, k, min(settings.held, k - w0 - new))
                 col.take(frames, done, False)

@@ -62,28 +62,28 @@ def _align(world: Array, camera: Array) -> Array:
     return se3.transform(R, mean_w[:, 0] - (R @ mean_c[:, 0, :, None])[..., 0])
 
 
-def find_pose(points: Array, rays: Rays, threshold_px: float, rng: np.random.Generator,
+def find_pose(points: Array, rays: Rays, usable: Bools, threshold_px: float, rng: np.random.Generator,
               guesses: Array | None = None) -> tuple[Array, Bools] | None:
-    """The pose (4, 4) that most of n homogeneous points (n, 4) agree with, and which ones do; None when none fits.
+    """The pose (4, 4) that most of n points agree with, and which ones (n,) do; None when there is no candidate.
 
     Args:
-        points: homogeneous world points with a finite distance.
+        points: (n, 4) homogeneous world points.
         rays: their directions as seen by the camera.
+        usable: (n,) points whose distance is known well enough to sample from.
         threshold_px: residual at which a point counts as wrong.
         rng: source of the samples.
         guesses: (G, 4, 4) poses that compete with the samples.
     """
-    n = len(points)
-    if n < 3:
-        return None
-    sample = rng.random((SAMPLES, n)).argsort(axis=1)[:, :3]
-    world = points[:, :3] / points[:, 3:]
-    poses = three_point_poses(world[sample], rays.bearing[sample])
-    if guesses is not None:
-        poses = np.concatenate([guesses, poses])
+    candidates = [] if guesses is None else [guesses]
+    known = np.flatnonzero(usable)
+    if len(known) >= 3:
+        sample = known[rng.random((SAMPLES, len(known))).argsort(axis=1)[:, :3]]
+        world = points[sample, :3] / points[sample, 3:]
+        candidates.append(three_point_poses(world, rays.bearing[sample]))
+    poses = np.concatenate(candidates) if candidates else np.zeros((0, 4, 4))
     if len(poses) == 0:
         return None
-    local = (world - poses[:, None, :3, 3]) @ poses[:, :3, :3]
+    local = (points[:, :3] - points[:, 3:] * poses[:, None, :3, 3]) @ poses[:, :3, :3]
     direction = local / np.maximum(np.linalg.norm(local, axis=2, keepdims=True), 1e-12)
     miss = np.linalg.norm((rays.to_pixels @ (direction - rays.bearing)[..., None])[..., 0], axis=2)
     miss = np.where((direction * rays.bearing).sum(axis=2) > 0, miss, np.inf)
