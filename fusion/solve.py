@@ -20,6 +20,9 @@ from vio.errors import EstimationError
 Array = NDArray[np.float64]
 
 SMALLEST_STEP = 1 / 128
+GROSS = 30.0
+"""Whitened norm beyond which the Huber loss only grows like a logarithm: a motion that claims 0.05 mm and is off by
+a metre would otherwise bend everything that the IMU does not hold."""
 
 
 @dataclass(frozen=True)
@@ -32,7 +35,7 @@ class MotionTerm:
     held_log_scale: float
     """Used where `segment` is None."""
     huber: float | None
-    """Threshold of the Huber loss; None for plain weights."""
+    """Threshold of the Huber loss (logarithmic beyond `GROSS`); None for plain weights."""
     weight: Array
     """(N,) fixed weights (the gate) on top of the loss."""
     first_node: int = 0
@@ -51,12 +54,13 @@ class MotionTerm:
 
     def losses(self, squared_norm: Array) -> tuple[float, Array]:
         """Total cost and the (N,) weights of the next linear step."""
-        norm = np.sqrt(squared_norm)
         if self.huber is None:
             return float(0.5 * (self.weight * squared_norm).sum()), self.weight
-        inside = norm <= self.huber
-        loss = np.where(inside, 0.5 * squared_norm, self.huber * norm - 0.5 * self.huber**2)
-        return float((self.weight * loss).sum()), self.weight * np.minimum(1.0, self.huber / np.maximum(norm, 1e-12))
+        k, norm = self.huber, np.maximum(np.sqrt(squared_norm), 1e-12)
+        straight = k * np.minimum(norm, GROSS) - 0.5 * k**2
+        loss = np.where(norm <= k, 0.5 * squared_norm, straight + k * GROSS * np.log(np.maximum(norm / GROSS, 1.0)))
+        weight = np.minimum(1.0, k / norm) * np.minimum(1.0, GROSS / norm)
+        return float((self.weight * loss).sum()), self.weight * weight
 
     def cost(self, values: gtsam.Values) -> float:
         """Robust cost at the given values."""

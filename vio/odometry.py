@@ -1,85 +1,103 @@
-"""Relative motion of a camera from tracks, without any network."""
+"""Classical relative motion from tracks: essential matrix to start, then PnP on triangulated tracks, no network.
+
+Every new frame is placed by points that are already in the map, so that one scale runs through it. Where a frame
+cannot be placed the map is closed and a new one begins. The longest map sets the unit; the others bring directions and
+rotations, with a translation whose length is next to unknown.
+"""
 
 from __future__ import annotations
+
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from vio import se3
-from vio.bundle import Adjustment
 from vio.camera import Camera
 from vio.errors import TrackingError
-from vio.mapper import Map, MapSettings
+from vio.mapping import Map, MapMotions, MapSettings
 from vio.motions import RelativeMotions
-from vio.rays import rays_from_pixels
+from vio.recording import Recording
+from vio.tracking import track_recording
 from vio.tracks import Tracks, check_frame_indices
 
 Array = NDArray[np.float64]
-Ints = NDArray[np.int64]
+
+OTHER_MAP_SCALE_SD = 1.0
+"""Relative sd of the length of a step in a map whose scale is not the longest map's."""
+LEAST_SD = np.array([1e-5] * 3 + [1e-5] * 3)
+"""Floor of the claimed sds [rad, units]: no image is better than this."""
 
 
-class _Collector:
-    def __init__(self, pairs: Ints) -> None:
-        self.pairs, self.cov = pairs, np.full((len(pairs), 6, 6), np.nan)
+@dataclass(frozen=True)
+class ScalePrior:
+    """What is known of the length of a motion unit before any inertial data: s = ln(metres per unit)."""
 
-    def take(self, frames: Ints, done: Adjustment, gauge_free: bool) -> None:
-        fixed, T = done.window.fixed, done.window.T_world_camera
-        F = int((~fixed).sum())
-        cov = done.covariance
-        if gauge_free:
-            grow = np.zeros((F, 6))
-            grow[:, 3:] = (np.swapaxes(T[~fixed, :3, :3], 1, 2) @ (T[~fixed, :3, 3] - T[0, :3, 3])[..., None])[..., 0]
-            g = grow.ravel() / max(np.linalg.norm(grow), 1e-12)
-            P = np.eye(len(g)) - np.outer(g, g)
-            cov = P @ cov @ P
-        C = cov.reshape(F, 6, F, 6)
-        row = np.full(frames.max() + 2, -1)
-        row[frames[~fixed]] = np.arange(F)
-        index = np.full(frames.max() + 2, -1); index[frames] = np.arange(len(frames))
-        for n, (i, j) in enumerate(self.pairs):
-            if j > frames[-1] or i < frames[0] or row[j] < 0 or index[i] < 0:
-                continue
-            if row[i] < 0 and not (gauge_free or np.isnan(self.cov[n, 0, 0])):
-                continue
-            A = -se3.adjoint(se3.inverse(T[index[j]]) @ T[index[i]])
-            S = C[row[j], :, row[j]].copy()
-            if row[i] >= 0:
-                S += A @ C[row[i], :, row[i]] @ A.T + A @ C[row[i], :, row[j]] + C[row[j], :, row[i]] @ A.T
-            self.cov[n] = S
+    log_mean: float = 0.0
+    log_sd: float = 1.5
+    """The default knows nothing but the order of magnitude."""
 
 
-def run_map(tracks, camera, pairs, settings):
-    rays, valid = rays_from_pixels(camera, tracks.pixel)
-    frame, track = tracks.frame[valid], tracks.track[valid]
-    _, track = np.unique(track, return_inverse=True)
-    m = Map(frame, track, rays.select(valid), tracks.n_frames, settings)
-    col = _Collector(pairs)
-    first = 0
-    while True:
-        s = m.find_start(first)
-        if s is None:
-            break
-        a, b, T = s
-        frames, done = m.start(a, b, T, first)
-        # unit: median distance
-        col.take(frames, done, True)
-        seg0 = frames[0]
-        k = b + 1
-        new = 0
-        while k < tracks.n_frames:
-            if not m.place(k, k - 1):
-                print('lost at', k)
-                break
-            m.triangulate(max(seg0, k - settings.window), k + 1)
-            new += 1
-            k += 1
-            few = m.known[m.track[m.seen(k-1)]].sum() < 3 * settings.min_points
-            if new >= settings.hop or few or k == tracks.n_frames:
-                w0 = max(seg0, k - settings.window)
-                frames, done = m.adjust_window(w0, k, min(settings.held, k - w0 - new))
-                col.take(frames, done, False)
-                new = 0
-        first = k
-        if k >= tracks.n_frames - 1:
-            break
-    return m, col
+def measure_motions(tracks: Tracks, camera: Camera, frame_t_s: ArrayLike, frame_indices: ArrayLike | None = None,
+                    prior: ScalePrior | None = None, settings: MapSettings | None = None) -> RelativeMotions:
+    """Motions of the camera between neighbouring frames, from tracks alone.
+
+    The motion unit is the median distance of the longest map's first points. Covariances are those of the windows'
+    adjustments, scaled to their residuals. Pairs that cannot be measured are left out.
+
+    Args:
+        tracks: observations in pixels, of frames 0 to M - 1.
+        camera: the camera that saw them.
+        frame_t_s: (M,) times of the frames [s].
+        frame_indices: frames to use (increasing), all when None; motions join neighbours among them.
+        prior: of the scale; by default nothing is known.
+        settings: of the maps.
+
+    Raises:
+        TrackingError: too few tracks, or no parallax anywhere.
+    """
+    t_s = np.asarray(frame_t_s, float)
+    if len(t_s) < tracks.n_frames:
+        raise TrackingError(f"{len(t_s)} frame times for tracks of {tracks.n_frames} frames; give one time per frame")
+    index = check_frame_indices(np.arange(tracks.n_frames) if frame_indices is None else frame_indices, tracks.n_frames)
+    maps = _grow_maps(Map(tracks.select_frames(index), camera, settings or MapSettings()))
+    longest = max(range(len(maps)), key=lambda n: len(maps[n].first))
+    maps = [part if n == longest else _loosened(part) for n, part in enumerate(maps)]
+    first, T, cov = (np.concatenate([getattr(part, name) for part in maps]) for name in ("first", "T", "cov"))
+    prior = prior or ScalePrior()
+    meta = {"method": "classical: essential matrix, PnP, sliding-window adjustment", "maps": len(maps)}
+    return RelativeMotions(t_s[index[first]], t_s[index[first + 1]], T, cov + np.diag(LEAST_SD**2), prior.log_mean,
+                           prior.log_sd, meta=meta)
+
+
+def measure_recording(recording: Recording, prior: ScalePrior | None = None) -> RelativeMotions:
+    """Track a recording's images and measure the motions between its frames.
+
+    Raises:
+        TrackingError: there are no images or no camera intrinsics, or as `measure_motions`.
+        RecordingError: an image cannot be read.
+    """
+    camera = recording.calibration.camera
+    if camera is None or not recording.has_images:
+        raise TrackingError(f"recording {recording.name}: classical motions need camera intrinsics and all image files")
+    return measure_motions(track_recording(recording), camera, recording.frame_t_s, prior=prior)
+
+
+def _grow_maps(world: Map) -> list[MapMotions]:
+    first, maps = 0, []
+    while first < world.n_frames - 1 and world.begin(first):
+        first = world.grow()
+        maps.append(world.motions())
+    maps = [part for part in maps if len(part.first)]
+    if not maps:
+        limits = f"{world.settings.min_tracks} tracks, {world.settings.start_parallax_deg:g} deg of parallax"
+        raise TrackingError(f"no two of {world.n_frames} frames share enough tracks with parallax (limits: {limits}); "
+                            "the view is still, blind or without texture")
+    return maps
+
+
+def _loosened(part: MapMotions) -> MapMotions:
+    """The same motions with the length of every step next to unknown: the map's own unit is arbitrary."""
+    step = np.zeros((len(part.first), 6))
+    R_t = np.swapaxes(part.T[:, :3, :3], 1, 2)
+    step[:, 3:] = (R_t @ part.T[:, :3, 3:])[:, :, 0]  # right perturbation: axes of the second camera
+    return replace(part, cov=part.cov + OTHER_MAP_SCALE_SD**2 * step[:, :, None] * step[:, None, :])
