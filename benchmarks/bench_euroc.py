@@ -18,12 +18,12 @@ import gtsam
 import numpy as np
 from eqvio_tracks import CAMERA, FRAME_RATE_HZ, load_eqvio_tracks
 from results import record, table
-from vio.odometry import measure_motions
 
 from fusion import RefineConfig, Refinement, refine
 from fusion.compare import compare, format_table
 from vio import Recording, open_recording
 from vio.metrics import nees
+from vio.odometry import measure_motions
 from vio.simulation import network_like_motions
 
 DATA = Path(__file__).resolve().parents[2] / "shared" / "data" / "euroc_v101"
@@ -86,10 +86,10 @@ def _classical(recording: Recording) -> str:
         rows += _rows(f"{FRAME_RATE_HZ / step:g} Hz, {len(motions)} motions", graph)
         text = text or _printed(graph)
     return ("## Classical motions from real features, first 30 s\n\n"
-            f"{len(tracks)} observations, {len(tracks) / len(frames):.0f} a frame. The drone stands on the ground for the "
-            "first seconds, where\nnothing shows parallax; motions begin when it takes off. Their unit is arbitrary, so "
-            f"the prior knows nothing of scale\n(sd {motions.scale_log_sd:g} in log).\n\n{table(HEADER, rows)}\n\n"
-            f"At {FRAME_RATE_HZ / CLASSICAL_STEPS[0]:g} Hz as printed:\n\n```\n{text}\n```")
+            f"{len(tracks)} observations, {len(tracks) / len(frames):.0f} a frame. The drone stands on the ground for\n"
+            "the first seconds, where nothing shows parallax; motions begin when it takes off. Their unit is\n"
+            f"arbitrary, so the prior knows nothing of scale (sd {motions.scale_log_sd:g} in log).\n\n"
+            f"{table(HEADER, rows)}\n\nAt {FRAME_RATE_HZ / CLASSICAL_STEPS[0]:g} Hz as printed:\n\n```\n{text}\n```")
 
 
 CLASSICAL_STEPS = (4, 1)

@@ -34,7 +34,7 @@ def vibration_inflation(samples: ImuSamples, imu_t_s: Array, node_t_s: Array, no
 
 
 def _excess(signal: Array, span: NDArray[np.int64], white_sd: float, share: float) -> Array:
-    """Factor on the density per interval `span[k]:span[k+1]`: the recording's own floor, and a share of what exceeds it.
+    """Factor on the density per interval `span[k]:span[k+1]`: the recording's own floor, and a share of the rest.
 
     All powers in units of the calibrated white noise's.
     """

@@ -95,7 +95,8 @@ def tangent_basis(points: Array) -> Array:
     v = points.copy()
     v[:, 3] += np.where(v[:, 3] >= 0, 1.0, -1.0)
     H = np.eye(4) - 2 * v[:, :, None] * v[:, None, :] / (v * v).sum(axis=1)[:, None, None]
-    return H[:, :, :3]
+    basis: Array = H[:, :, :3]
+    return basis
 
 
 @dataclass(frozen=True)
@@ -216,7 +217,7 @@ def adjust(window: Window, noise: TrackNoise, iterations: int = 15, tolerance: f
         if cost - new_cost < tolerance * cost:
             break
     S = problem.normal_equations(window).reduced(0.0)[0] * noise.information_loss
-    return Adjustment(window, window.residuals(), np.linalg.pinv(S, hermitian=True))
+    return Adjustment(window, window.residuals(), np.asarray(np.linalg.pinv(S, hermitian=True), float))
 
 
 def _moved(window: Window, basis: Array, d_poses: Array, d_points: Array) -> Window:

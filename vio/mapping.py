@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import cv2
 import numpy as np
@@ -197,7 +197,8 @@ class Map:
         rows = rows[np.isfinite(self.T[self.frame[rows], 0, 0])]
         rows = rows[np.lexsort((self.frame[rows], self.track[rows]))]
         _, inverse, count = np.unique(self.track[rows], return_inverse=True, return_counts=True)
-        return rows[count[inverse] >= 2]
+        twice: Ints = rows[count[inverse] >= 2]
+        return twice
 
     def _triangulate(self, start: int, end: int) -> None:
         """Points nearest to the rays of tracks that have none yet, where their parallax is large enough."""
@@ -212,7 +213,7 @@ class Map:
         A, b = np.zeros((len(ids), 3, 3)), np.zeros((len(ids), 3))
         np.add.at(A, group, normal)
         np.add.at(b, group, (normal @ T[:, :3, 3:])[:, :, 0])
-        point = np.linalg.solve(A + 1e-12 * np.eye(3), b[:, :, None])[:, :, 0]
+        point = np.asarray(np.linalg.solve(A + 1e-12 * np.eye(3), b[:, :, None])[:, :, 0], float)
         self.point[ids] = np.where(self._good(point[group], T, ray, rows, group, len(ids))[:, None], point, np.nan)
 
     def _good(self, point: Array, T: Array, ray: Array, rows: Ints, group: Ints, count: int) -> Bools:
@@ -221,8 +222,9 @@ class Map:
         angle = np.maximum.reduceat(np.linalg.norm(np.cross(ray[first][group], ray), axis=1), first)
         local = (np.swapaxes(T[:, :3, :3], 1, 2) @ (point - T[:, :3, 3])[:, :, None])[:, :, 0]
         depth = np.linalg.norm(local, axis=1)
-        miss = self.rays.to_pixels[rows] @ (local / np.maximum(depth, 1e-12)[:, None] - self.rays.bearing[rows])[..., None]
-        wrong = (np.linalg.norm(miss[:, :, 0], axis=1) > 3 * self.settings.threshold_px) | (local[:, 2] <= 0)
+        off_ray = local / np.maximum(depth, 1e-12)[:, None] - self.rays.bearing[rows]
+        miss_px = np.linalg.norm((self.rays.to_pixels[rows] @ off_ray[:, :, None])[:, :, 0], axis=1)
+        wrong = (miss_px > 3 * self.settings.threshold_px) | (local[:, 2] <= 0)
         known = np.isfinite(self.point[:, 0])
         typical = np.median(np.linalg.norm(self.point[known] - T[-1, :3, 3], axis=1)) if known.any() else np.inf
         wrong |= depth > FARTHEST * typical

@@ -51,5 +51,5 @@ def rays_from_pixels(camera: Camera, pixels: ArrayLike) -> tuple[Rays, NDArray[n
     gram = np.swapaxes(slope, 1, 2) @ slope
     valid = np.isfinite(bearing).all(axis=1) & np.isfinite(gram).all(axis=(1, 2))
     gram[~valid] = np.eye(2)
-    to_pixels = np.linalg.solve(gram, np.swapaxes(slope, 1, 2))
+    to_pixels = np.asarray(np.linalg.solve(gram, np.swapaxes(slope, 1, 2)), float)
     return Rays(bearing, to_pixels), valid

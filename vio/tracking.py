@@ -97,7 +97,8 @@ class _Tracker:
     """The corners alive in the last frame."""
 
     def __init__(self, settings: TrackerSettings) -> None:
-        self.settings, self.before = settings, None
+        self.settings = settings
+        self.before: Image | None = None
         self.ids = np.zeros(0, np.int64)
         self.points = np.zeros((0, 1, 2), np.float32)
         self.next_id = 0
@@ -115,9 +116,9 @@ class _Tracker:
 
     def _follow(self, before: Image, now: Image, mask: Image) -> None:
         s = self.settings
-        options = {"winSize": (s.window_px, s.window_px), "maxLevel": s.pyramid_levels}
-        ahead, found, _ = cv2.calcOpticalFlowPyrLK(before, now, self.points, None, **options)
-        back, found_back, _ = cv2.calcOpticalFlowPyrLK(now, before, ahead, None, **options)
+        window, levels = (s.window_px, s.window_px), s.pyramid_levels
+        ahead, found, _ = cv2.calcOpticalFlowPyrLK(before, now, self.points, None, winSize=window, maxLevel=levels)
+        back, found_back, _ = cv2.calcOpticalFlowPyrLK(now, before, ahead, None, winSize=window, maxLevel=levels)
         miss = np.linalg.norm((back - self.points)[:, 0], axis=1)
         column, row = np.round(ahead[:, 0]).T
         inside = (column >= 0) & (row >= 0) & (column < now.shape[1]) & (row < now.shape[0])

@@ -58,7 +58,7 @@ def check_frame_indices(index: ArrayLike, n_frames: int) -> Ints:
                             f"{n_frames - 1}")
     if (np.diff(index) <= 0).any():
         k = int(np.argmax(np.diff(index) <= 0)) + 1
-        raise TrackingError(f"frame indices[{k}] = {index[k]} does not follow {index[k - 1]}; sort them, drop duplicates")
+        raise TrackingError(f"frame indices[{k}] = {index[k]} does not follow {index[k - 1]}; sort, drop duplicates")
     return index.astype(np.int64)
 
 
