@@ -3,7 +3,7 @@
 A tracker that follows a patch from frame to frame hands its error on, so the error of a track is closer to a
 random walk than to fresh noise. It is modelled as first-order autoregressive, `e_k = a e_{k-1} + n_k`, with
 `n` from a two-dimensional Student-t distribution (slips of a patch are its tail). `a = 0` and many degrees of
-freedom are ordinary white Gaussian noise. All three parameters are fitted to residuals by maximum likelihood.
+freedom are ordinary white Gaussian noise.
 Source of the t weights: Lange, Little and Taylor, "Robust statistical modeling using the t distribution" (1989).
 """
 
@@ -13,15 +13,9 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import gammaln
 
 Array = NDArray[np.float64]
 Bools = NDArray[np.bool_]
-
-CORRELATIONS = (0.0, 0.3, 0.6, 0.8, 0.9, 0.95, 0.98)
-DEGREES_OF_FREEDOM = (1.0, 1.5, 2.0, 3.0, 5.0, 10.0, 30.0)
-SIGMA_FLOOR_PX = 1e-3
-EM_STEPS = 15
 
 
 @dataclass(frozen=True)
@@ -62,30 +56,3 @@ def whiten(values: Array, starts: Bools, correlation: float) -> Array:
     first = starts.reshape(-1, *[1] * (values.ndim - 1))
     before = np.roll(values, 1, axis=0)
     return np.asarray(np.where(first, values * np.sqrt(1 - correlation**2), values - correlation * before))
-
-
-def fit_noise(residual: Array, starts: Bools, unknowns: int) -> TrackNoise:
-    """The most likely noise of residuals (O, 2) [px] that are left after fitting `unknowns` numbers."""
-    best, best_cost = TrackNoise(), np.inf
-    for correlation in CORRELATIONS:
-        white = whiten(residual, starts, correlation)
-        tracks = 2 * starts.sum() * np.log1p(-(correlation**2))
-        for dof in DEGREES_OF_FREEDOM:
-            sigma, cost = _fit_scale(white, dof)
-            if cost - tracks < best_cost:
-                best, best_cost = TrackNoise(sigma, correlation, dof), cost - tracks
-    left = max(1 - unknowns / max(residual.size, 1), 0.2)
-    return TrackNoise(max(best.sigma_px / np.sqrt(left), SIGMA_FLOOR_PX), best.correlation, best.dof)
-
-
-def _fit_scale(white: Array, dof: float) -> tuple[float, float]:
-    """Scale of the t distribution by expectation-maximisation, and minus twice the log likelihood."""
-    square = (white**2).sum(axis=1)
-    variance = max(float(np.median(square)) / (2 * np.log(2)), SIGMA_FLOOR_PX**2)
-    for _ in range(EM_STEPS):
-        weight = (dof + 2) / (dof + square / variance)
-        variance = max(float((weight * square).mean()) / 2, SIGMA_FLOOR_PX**2)
-    n = len(square)
-    constant = gammaln(dof / 2 + 1) - gammaln(dof / 2) - np.log(dof * np.pi)
-    cost = n * (2 * np.log(variance) - 2 * constant) + (dof + 2) * np.log1p(square / (dof * variance)).sum()
-    return float(np.sqrt(variance)), float(cost)
