@@ -158,10 +158,10 @@ def _nearest(t: Array, frames: Array, name: str) -> NDArray[np.int64]:
 
 def chain_motions(motions: RelativeMotions, frame_t_s: ArrayLike, T_body_camera: ArrayLike,
                   T_world_first: ArrayLike | None = None) -> tuple[Trajectory, int]:
-    """Chain consecutive motions at the prior scale: the trajectory of the motions alone.
+    """Chain motions at the prior scale: the trajectory of the motions alone.
 
-    Only motions between neighbouring frames are used (the most certain one where several measure the
-    same pair). A pair that no motion measures is bridged by standing still.
+    Neighbouring frames are joined by the most certain motion between them. Frames that only a wider motion spans lie
+    on its screw, evenly spaced. A pair that no motion spans is bridged by standing still.
 
     Args:
         motions: measured motions of the camera.
@@ -175,15 +175,15 @@ def chain_motions(motions: RelativeMotions, frame_t_s: ArrayLike, T_body_camera:
     frames = np.asarray(frame_t_s, float)
     T_body_camera = np.asarray(T_body_camera, float)
     i, j = match_frames(motions, frames)
-    size = np.trace(motions.cov, axis1=1, axis2=2)
-    order = np.argsort(-size, kind="stable")
-    order = order[(j - i)[order] == 1]
+    metric = motions.T_i_j.copy()
+    metric[:, :3, 3] *= np.exp(motions.scale_log_mean)
+    body = T_body_camera @ metric @ se3.inverse(T_body_camera)
     steps = np.broadcast_to(np.eye(4), (len(frames) - 1, 4, 4)).copy()
     measured = np.zeros(len(frames) - 1, bool)
-    metric = motions.T_i_j[order].copy()
-    metric[:, :3, 3] *= np.exp(motions.scale_log_mean)
-    steps[i[order]] = T_body_camera @ metric @ se3.inverse(T_body_camera)
-    measured[i[order]] = True
+    certainty = np.trace(motions.cov, axis1=1, axis2=2)
+    for n in np.lexsort((certainty, j - i)):  # short before wide, certain before uncertain
+        span = slice(i[n], j[n])
+        if not measured[span].any():
+            steps[span] = se3.exp(se3.log(body[n]) / (j[n] - i[n])) if j[n] - i[n] > 1 else body[n]
+            measured[span] = True
     return Trajectory(frames, se3.chain(steps, T_world_first)), int((~measured).sum())
-
-
