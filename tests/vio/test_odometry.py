@@ -4,8 +4,6 @@ import dataclasses
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
 from vio import se3
 from vio.calibration import Calibration
@@ -15,7 +13,6 @@ from vio.errors import TrackingError
 from vio.imu import ImuNoise, ImuSamples
 from vio.odometry import measure_motions, measure_recording
 from vio.recording import Recording
-from vio.rigid_fit import fit_rigid
 from vio.tracks import tracks_from_table
 
 PINHOLE = Camera("pinhole", 320, 320, 160.0, 160.0, 160.0, 160.0, (0.1, -0.05, 0.0, 0.0))
@@ -185,13 +182,3 @@ def test_motion_from_depth_needs_depth_and_a_camera():
         measure_motions_with_depth(blind, lambda k: None, tracks=tracks)
     with pytest.raises(TrackingError, match="image"):
         measure_recording(blind)
-
-
-@given(st.lists(st.floats(-2, 2), min_size=3, max_size=3), st.floats(0, 1), st.integers(0, 2**32 - 1))
-def test_rigid_fit_is_exact_without_noise(direction, size, seed):
-    rng = np.random.default_rng(seed)
-    q = rng.normal(size=(1, 12, 3))
-    T = se3.exp(np.concatenate([size * 1e-3 * np.array(direction), rng.normal(size=3)]))
-    p = q @ T[:3, :3].T + T[:3, 3]
-    fit = fit_rigid(p, q, 0.01)
-    assert np.abs(fit.T_i_j[0] - T).max() < 1e-8 and fit.observable[0]
