@@ -64,7 +64,7 @@ class GraphEstimator:
             start = self._start(start_scale, 1.0)
         with self.stages("fixed_scale"):
             fixed = self._fixed_pass(start, start_scale)
-        final, conclusion, inflation = self._decide(start, fixed, start_scale)
+        final, conclusion, inflation = self._decide(fixed, start_scale)
         with self.stages("covariances"):
             return self._read(final, conclusion, fixed.imu_chi2, inflation)
 
@@ -98,15 +98,17 @@ class GraphEstimator:
         chi2 = scale_policy.imu_chi2(solution.native_cost, int(self.problem.imu_usable.sum()))
         return _Pass(native, term, solution, chi2)
 
-    def _decide(self, start: Start, fixed: _Pass, start_scale: float) -> tuple[_Pass, ScaleConclusion, float]:
+    def _decide(self, fixed: _Pass, start_scale: float) -> tuple[_Pass, ScaleConclusion, float]:
         """Try scale free; where it cannot be measured keep the prior's; where the IMU disagrees, trust it less."""
         policy = self.config.scale.policy
         if policy == "fixed" or self.problem.scale_log_sd == 0:
             reason = "asked for" if policy == "fixed" else "the source declares its scale exactly known"
             return self._held(fixed, "fixed", start_scale, reason, 1.0)
         if policy == "prior":
-            return self._down_weighted(start_scale, "asked for")
-        final, free = self._free_pass(start, fixed, start_scale)
+            calm = fixed.imu_chi2 <= self.config.scale.imu_chi2_limit
+            return (self._held(fixed, "prior", start_scale, "asked for", 1.0) if calm
+                    else self._down_weighted(start_scale, "a prior was asked for and the IMU disagrees"))
+        final, free = self._free_pass(fixed, start_scale)
         objection = scale_policy.reasons_against(free, self.problem, self.config.scale)
         if policy == "free":
             conclusion = scale_policy.conclude_free(free, self.problem)
@@ -125,7 +127,7 @@ class GraphEstimator:
                 fixed = self._fixed_pass(start, start_scale)
             if fixed.imu_chi2 > scale_policy.CALM_CHI2:
                 continue
-            final, free = self._free_pass(start, fixed, start_scale)
+            final, free = self._free_pass(fixed, start_scale)
             if scale_policy.reasons_against(free, self.problem, self.config.scale) is None:
                 reason = f"scale near its prior, accelerometer noise × {inflation:g}: {why}"
                 conclusion = scale_policy.conclude_free(free, self.problem)
@@ -141,7 +143,7 @@ class GraphEstimator:
             final = self._gated(fixed)
         return final, ScaleConclusion(policy, log_scale, self.problem.scale_log_sd, reason), inflation
 
-    def _free_pass(self, start: Start, fixed: _Pass, start_scale: float) -> tuple[_Pass, FreePass]:
+    def _free_pass(self, fixed: _Pass, start_scale: float) -> tuple[_Pass, FreePass]:
         scale, problem = self.config.scale, self.problem
         native = gtsam.NonlinearFactorGraph(fixed.native)
         add_scale_walk(native, self.segments.t_s, problem.scale_log_mean, problem.scale_log_sd, scale.walk_per_sqrt_s)
