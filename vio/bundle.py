@@ -161,6 +161,7 @@ class _Problem:
         return self.noise.cost(self.whitened(window)) + float((self.depth_prior(window.points)[0] ** 2).sum())
 
     def normal_equations(self, window: Window) -> _Normal:
+        """Weighted normal equations at a window, with the whitened residuals' coupling of neighbouring poses."""
         a, starts, basis = self.noise.correlation, self.starts, tangent_basis(window.points)
         r, J_pose, J_point = direction_residuals(
             window.T_world_camera[window.pose], window.points[window.point], window.rays)
