@@ -41,7 +41,7 @@ def summarize(refinement: Refinement) -> dict[str, Any]:
 
 
 def accuracy_of(estimates: dict[str, Trajectory], truth: Trajectory) -> dict[str, Any]:
-    """Accuracy under every alignment and the paper's per-step metrics, both of the BODY's poses, on the same frames."""
+    """Accuracy under every alignment and the paper's per-step metrics, of the BODY's poses, on the same frames."""
     return {
         "accuracy": {name: accuracy_table(estimate, truth) for name, estimate in estimates.items()},
         "paper_metrics": {name: _paper_metrics(estimate, truth) for name, estimate in estimates.items()},

@@ -15,8 +15,8 @@ from vio.imu import ImuNoise, ImuSamples
 Array = NDArray[np.float64]
 
 ACCEL_SHARE, GYRO_SHARE = 0.15, 0.3
-"""Share of the excess second difference that ends up as integration error. Chosen on simulated collisions, seeds 101-112:
-smaller shares leave the poses overconfident, larger ones make the scale come out short."""
+"""Share of the excess second difference that ends up as integration error. Chosen on simulated collisions, seeds
+101-112: smaller shares leave the poses overconfident, larger ones make the scale come out short."""
 FLOOR_PERCENTILE = 20.0
 """The power that four of five intervals exceed is noise that is always there, whatever the data sheet says."""
 QUIET = 2.0
