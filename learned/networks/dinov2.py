@@ -17,6 +17,7 @@ from torch import Tensor, nn
 from learned.errors import NetworkInputError, WeightsError
 from learned.networks.dv_lora import RANK, DvLoraLinear
 from learned.networks.encoder import Encoder, FuseBlock, keep_features
+from learned.networks.pretrained import check_safetensors
 from vio.errors import ConfigError
 
 PATCH, CELL = 14, 16
@@ -56,7 +57,7 @@ class DinoEncoder(Encoder):
 
     Raises:
         ConfigError: `transformers` is not installed, or a tap beyond the last block.
-        WeightsError: the folder is missing, or holds a transformer of another size.
+        WeightsError: the folder is missing or damaged, or holds a transformer of another size.
     """
 
     def __init__(self, shape: DinoShape, weights: str | Path | None = None, frozen: bool = True) -> None:
@@ -66,6 +67,7 @@ class DinoEncoder(Encoder):
         self.shape = shape
         self.vit = _transformer(shape, weights)
         self.vit.requires_grad_(not frozen)
+        self.vit.embeddings.mask_token.requires_grad_(False)  # nothing is masked here
         for layer in self.vit.encoder.layer:
             layer.mlp.fc1 = DvLoraLinear(layer.mlp.fc1, shape.rank)
             layer.mlp.fc2 = DvLoraLinear(layer.mlp.fc2, shape.rank)
@@ -161,13 +163,28 @@ def _transformer(shape: DinoShape, weights: str | Path | None) -> Any:
             image_size=TRAINED_SIZE, patch_size=PATCH,
         )
         return transformers.Dinov2Model(config)
-    folder = Path(weights)
-    if not (folder / "config.json").is_file() or not (folder / "model.safetensors").is_file():
-        raise WeightsError(f"{folder.name}: no config.json and model.safetensors of DINOv2 in it; give a local folder "
-                           "that transformers saved")
-    model = transformers.Dinov2Model.from_pretrained(folder, local_files_only=True, use_safetensors=True)
+    return _loaded(transformers, shape, Path(weights))
+
+
+def _loaded(transformers: Any, shape: DinoShape, folder: Path) -> Any:
+    """A transformer from a local folder; nothing of it is left at random in silence."""
+    if not (folder / "config.json").is_file():
+        raise WeightsError(f"{folder.name}: no config.json in it; give the folder that transformers saved DINOv2 to")
+    check_safetensors(folder / "model.safetensors")
+    try:
+        model, info = transformers.Dinov2Model.from_pretrained(
+            folder, local_files_only=True, use_safetensors=True, output_loading_info=True)
+    except (OSError, ValueError, RuntimeError) as error:
+        raise WeightsError(f"{folder.name}: not a DINOv2 that transformers can load ({_line(error)})") from None
     found = (model.config.hidden_size, model.config.num_hidden_layers, model.config.patch_size)
     if found != (shape.channels, LAYERS, PATCH):
         raise WeightsError(f"{folder.name}: channels, blocks, patch are {found}, expected "
                            f"{(shape.channels, LAYERS, PATCH)}; choose the transformer of this size")
+    missing = sorted(set(info["missing_keys"]) - {"embeddings.mask_token"})
+    if missing:
+        raise WeightsError(f"{folder.name}: tensor {missing[0]!r} is missing; give all weights of DINOv2")
     return model
+
+
+def _line(error: Exception) -> str:
+    return " ".join(str(error).split())[:200]

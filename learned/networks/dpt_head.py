@@ -34,7 +34,9 @@ class DptHead(nn.Module):
             nn.Conv2d(four, four, 3, 2, 1),
         ])
         self.to_features = nn.ModuleList(nn.Conv2d(c, features, 3, 1, 1, bias=False) for c in level_channels)
-        self.refine = nn.ModuleList(RefineBlock(features) for _ in level_channels)
+        blocks = [RefineBlock(features) for _ in level_channels]
+        blocks[-1].level.requires_grad_(False)  # the coarsest level skips it; it is there for the published size
+        self.refine = nn.ModuleList(blocks)
         self.heads = nn.ModuleList(HeadDepth(features) for _ in level_channels)
 
     def forward(self, maps: list[Tensor]) -> tuple[Tensor, ...]:

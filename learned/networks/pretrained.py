@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import torch
-from safetensors import SafetensorError
+from safetensors import SafetensorError, safe_open
 from safetensors.torch import load_file
 from torch import Tensor, nn
 
@@ -57,13 +57,24 @@ def read_safetensors(path: str | Path) -> dict[str, Tensor]:
     Raises:
         WeightsError: the file is missing, damaged, or not safetensors: pickles are never opened.
     """
+    path = check_safetensors(path)
+    return load_file(path)
+
+
+def check_safetensors(path: str | Path) -> Path:
+    """The path of a file whose header and length are those of safetensors.
+
+    Raises:
+        WeightsError: the file is missing, damaged, or not safetensors.
+    """
     path = Path(path)
     if not path.is_file():
         raise WeightsError(f"{path.name}: no such file; give a local safetensors file")
     if path.suffix != ".safetensors":
         raise WeightsError(f"{path.name}: not a safetensors file; pickled weights are refused, convert them")
     try:
-        return load_file(path)
+        with safe_open(path, framework="pt"):
+            return path
     except (SafetensorError, OSError) as error:
         raise WeightsError(f"{path.name}: cannot be read as safetensors ({error})") from None
 

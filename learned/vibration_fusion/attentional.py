@@ -18,13 +18,14 @@ from learned.vibration_fusion.pointwise import spread
 class MultiScaleAttention(nn.Module):
     """M(X) = σ(L(X) + G(mean of X)): two bottlenecks of 1x1 convolutions, one per cell, one for the whole map.
 
-    Normalised by group norm over all channels: batch norm fails on the 1x1 map of the global branch at batch 1.
+    The article normalises over the batch, which fails at batch 1 on the single cell of the global branch: here the
+    local branch is normalised over each sample's map, the global one not at all.
     """
 
     def __init__(self, channels: int, reduction: int) -> None:
         super().__init__()
         self.local_branch = _bottleneck(channels, reduction)
-        self.global_branch = _bottleneck(channels, reduction)
+        self.global_branch = _bottleneck(channels, reduction, normalised=False)
 
     def forward(self, x: Tensor) -> Tensor:
         """(N, C, H, W) → weights in 0..1, same shape."""
@@ -65,7 +66,7 @@ def _selected(weights: Tensor, x: Tensor, y: Tensor) -> Tensor:
     return weights * x + (1 - weights) * y
 
 
-def _bottleneck(channels: int, reduction: int) -> nn.Sequential:
-    inner = max(1, channels // reduction)
-    return nn.Sequential(nn.Conv2d(channels, inner, 1), nn.GroupNorm(1, inner), nn.ReLU(),
-                         nn.Conv2d(inner, channels, 1), nn.GroupNorm(1, channels))
+def _bottleneck(channels: int, reduction: int, normalised: bool = True) -> nn.Sequential:
+    inner = max(2, channels // reduction)
+    norms = [nn.GroupNorm(1, c) if normalised and c > 1 else nn.Identity() for c in (inner, channels)]
+    return nn.Sequential(nn.Conv2d(channels, inner, 1), norms[0], nn.ReLU(), nn.Conv2d(inner, channels, 1), norms[1])

@@ -66,7 +66,8 @@ def wiener_filter(features: Tensor, kernel: Tensor | None, snr: Tensor) -> Tenso
 class FourierFusion(VibrationFusion):
     """The filter at one block; the SNR is a linear map of the vibration's features, the kernel is learned.
 
-    Computes in float32 inside autocast: half-precision FFTs know only few sizes.
+    Computes in float32 inside autocast: half-precision FFTs know only few sizes. An SNR means what it says where the
+    kernel passes signals unamplified: a kernel of gain c and an SNR of r / c² give the same filter up to a factor.
     """
 
     def __init__(self, channels: int, vibration_features: int, config: FusionConfig) -> None:
