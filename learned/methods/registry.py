@@ -13,6 +13,7 @@ import torch
 from learned.methods import af_sfmlearner, endodac, endosfmlearner, gyro_correlation, ra_depth
 from learned.methods.config import MethodConfig, config_from_dict
 from learned.methods.method import Method, Networks
+from learned.vibration_fusion import FusionConfig
 from vio.errors import ConfigError
 
 CONFIGS: dict[str, type[MethodConfig]] = {kind.name: kind for kind in (
@@ -29,14 +30,14 @@ BUILDERS: dict[str, Callable[..., Networks]] = {
 
 
 def method_config(
-    name: str, *, vibration: bool = True, fusion: str = "fourier", width: float = 1.0, **options: Any
+    name: str, *, vibration: bool = True, fusion: str | FusionConfig = "fourier", width: float = 1.0, **options: Any
 ) -> MethodConfig:
     """A method's decisions, its own defaults where nothing is said.
 
     Args:
         name: endosfmlearner, af-sfmlearner, ra-depth, endodac or gyro-correlation.
         vibration: with branch and fusion.
-        fusion: strategy.
+        fusion: strategy by name, or with its open choices decided.
         width: factor on the channels.
         options: other fields of the method's config, parts of it as dictionaries.
 
@@ -44,14 +45,14 @@ def method_config(
         ConfigError: an unknown method, strategy or option, or a value outside its range.
     """
     config = config_from_dict({"name": name, "vibration": vibration, "width": width, **options}, CONFIGS)
-    return replace(config, fusion=replace(config.fusion, strategy=fusion))
+    return replace(config, fusion=FusionConfig(fusion) if isinstance(fusion, str) else fusion)
 
 
 def build_method(
     name: str,
     *,
     vibration: bool = True,
-    fusion: str = "fourier",
+    fusion: str | FusionConfig = "fourier",
     width: float = 1.0,
     seed: int = 0,
     encoder_weights: str | Path | None = None,

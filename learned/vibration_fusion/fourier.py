@@ -58,7 +58,8 @@ def wiener_filter(features: Tensor, kernel: Tensor | None, snr: Tensor) -> Tenso
         return features * (r / (r + 1))
     height, width = features.shape[-2:]
     H = transfer_function(kernel, height, width)
-    gain = r * H.conj() / (r * (H.real**2 + H.imag**2) + 1)
+    weight = r / (r * (H.real**2 + H.imag**2) + 1)
+    gain = torch.complex(H.real * weight, -H.imag * weight)  # real products: complex division costs twice the time
     filtered: Tensor = torch.fft.irfft2(torch.fft.rfft2(features) * gain, s=(height, width))
     return filtered
 

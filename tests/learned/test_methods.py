@@ -18,7 +18,7 @@ from learned.methods import (
     method_config,
     snr_summary,
 )
-from learned.vibration_fusion import STRATEGIES
+from learned.vibration_fusion import STRATEGIES, FusionConfig
 from vio.errors import ConfigError, VioError
 
 NAMES = tuple(CONFIGS)
@@ -228,11 +228,12 @@ def test_what_a_network_cannot_take_is_refused_in_one_line():
 
 @pytest.mark.parametrize("name", NAMES)
 def test_a_config_survives_a_file(name):
-    config = method_config(name, width=0.25, fusion="iaff", shared_branch=False, branch={"hidden": 4},
+    fusion = FusionConfig("iaff", attention_reduction=2)
+    config = method_config(name, width=0.25, fusion=fusion, shared_branch=False, branch={"hidden": 4},
                            pose={"scale": 0.5}, image_size=[96, 64])
     again = config_from_dict(json.loads(json.dumps(config_to_dict(config))), CONFIGS)
     assert again == config and again.branch.hidden == 4 and again.image_size == (96, 64)
-    assert again.fusion.strategy == "iaff"
+    assert again.fusion == fusion
 
 
 def test_wrong_choices_are_refused():
