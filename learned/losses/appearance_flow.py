@@ -17,8 +17,8 @@ from torch import Tensor
 from learned.camera_rays import CameraBatch, pixel_grid
 from learned.losses.photometric import Photometric, photometric_map
 from learned.losses.smoothness import edge_aware_smoothness, mean_normalised
-from learned.losses.terms import LossTerms, masked_mean
-from learned.warping import DepthKind, project_depth, sample
+from learned.losses.terms import LossTerms, full_precision, masked_mean
+from learned.warping import WHOLE, DepthKind, project_depth, sample
 
 
 @dataclass(frozen=True)
@@ -100,27 +100,30 @@ def appearance_loss(target: Tensor, sources: Tensor, depths: Sequence[Tensor], d
         cameras: B cameras.
         appearance: per scale (B, S, C, H, W), the change of light to add to the target, about -1..1.
         registered: from stage 1.
-        usable: (B, 1, H, W) bool of the target; None = everywhere. The published code has no such mask.
+        usable: (B, 1, H, W) bool, of targets and sources alike (the vignette stays); None = everywhere.
         settings: weights.
     """
     batch, count = sources.shape[:2]
-    still, visible = registered.image.detach().flatten(0, 1), registered.visible.flatten(0, 1)
+    still, visible = full_precision(registered.image.detach()).flatten(0, 1), registered.visible.flatten(0, 1)
     wide = target.repeat_interleave(count, 0)
     rows = torch.arange(batch, device=target.device).repeat_interleave(count)
     views = cameras.select(rows)
+    whole = torch.ones_like(visible) if usable is None else usable[rows]
+    visible = visible & whole
     sums: dict[str, Tensor] = {}
     weighted = target.new_zeros(())
     for scale, (depth, disparity, change) in enumerate(zip(depths, disparities, appearance, strict=True)):
         where = project_depth(depth[rows], T_target_source.flatten(0, 1), views, settings.depth_kind)
-        counted = visible & where.valid if usable is None else visible & where.valid & usable[rows]
         pixels = torch.where(where.valid, where.pixels, torch.zeros_like(where.pixels))
         warped = sample(sources.flatten(0, 1), pixels, "border", settings.mismatched_corners)
-        refined = (wide + visible * change.flatten(0, 1)).clamp(0, 1)
+        counted = visible & where.valid & (sample(whole.to(pixels.dtype), pixels) > WHOLE)
+        change = full_precision(change).flatten(0, 1)
+        refined = (wide + visible * change).clamp(0, 1)
         guide = F.interpolate(target, disparity.shape[-2:], mode="area")
         terms = {
             "photometric": masked_mean(photometric_map(warped, refined, settings.photometric), counted),
             "residue": masked_mean((refined - still).abs(), visible),
-            "appearance_smoothness": edge_aware_smoothness(change.flatten(0, 1), (still - wide).abs(), visible),
+            "appearance_smoothness": edge_aware_smoothness(change, (still - wide).abs(), visible),
             "disparity_smoothness": edge_aware_smoothness(mean_normalised(disparity), guide),
         }
         sums = {name: sums.get(name, 0) + value for name, value in terms.items()}

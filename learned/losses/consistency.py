@@ -6,7 +6,7 @@ al. 2019), and its inverse must be smooth. The settings differ, the function doe
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Literal
 
 import torch
@@ -96,10 +96,12 @@ def _prepared(snippet: Snippet, settings: Consistency) -> Snippet:
                                < settings.smallest_px):
         raise ConfigError(f"losses: {settings.levels} pyramid levels of {width} x {height} pixels (limit: the smallest "
                           f"side stays ≥ {settings.smallest_px}); use fewer levels or larger images")
+    dtype = snippet.cameras.intrinsics.dtype
+    snippet = replace(snippet, images=snippet.images.to(dtype), depth=snippet.depth.to(dtype))
     if settings.mask_highlights:
         clear = without_highlights(snippet.images.flatten(0, 1)).view_as(snippet.depth)
         usable = clear if snippet.usable is None else clear & snippet.usable
-        snippet = Snippet(snippet.images, snippet.depth, snippet.motions, snippet.cameras, usable)
+        snippet = replace(snippet, usable=usable)
     return snippet.luminance() if settings.luminance else snippet
 
 
@@ -108,13 +110,12 @@ def _pair_terms(pairs: Pairs, settings: Consistency) -> tuple[Tensor, Tensor, Te
     seen = synthesise(pairs.source, pairs.source_depth, pairs.target_depth, pairs.T_target_source, pairs.cameras,
                       settings.depth_kind, pairs.target_usable, pairs.source_usable, settings.padding,
                       settings.mismatched_corners)
-    target = pairs.target.to(seen.image.dtype)
-    different, mask = compare(seen.image, target, seen.valid, settings.photometric)
+    different, mask = compare(seen.image, pairs.target, seen.valid, settings.photometric)
     apart = depth_difference(seen.computed_depth, seen.sampled_depth)
     valid = seen.valid
     if settings.auto_mask:
         with torch.no_grad():
-            still = compare(pairs.source.to(target.dtype), target, seen.valid, settings.photometric)[0]
+            still = compare(pairs.source, pairs.target, seen.valid, settings.photometric)[0]
         mask, valid = mask & moving(different, still), valid & moving(different, still)
     if settings.weigh_by_agreement:
         different = different * (1 - apart)

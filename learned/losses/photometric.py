@@ -16,6 +16,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from learned.losses.masks import whole_windows
+from learned.losses.terms import full_precision
 
 C1, C2 = 0.01**2, 0.03**2
 LEAST_VARIANCE = 1e-8  # of an image whose brightness is matched: 1/40 of a grey level
@@ -54,6 +55,7 @@ def ssim(a: Tensor, b: Tensor) -> Tensor:
 
 def photometric_map(a: Tensor, b: Tensor, settings: Photometric) -> Tensor:
     """How different images (B, C, H, W) are at every pixel: (B, 1, H, W), 0 where they agree."""
+    a, b = full_precision(a), full_precision(b)
     structure = ((1 - ssim(a, b)) / 2).clamp(0, 1).mean(1, keepdim=True)
     if settings.norm == "l1":
         colour = (a - b).abs().mean(1, keepdim=True)
@@ -74,6 +76,7 @@ def match_brightness(warped: Tensor, target: Tensor, valid: Tensor, settings: Ph
         valid: (B, 1, H, W) bool.
         settings: per image or channel, and the parity switches.
     """
+    warped, target = full_precision(warped), full_precision(target)
     with torch.no_grad():
         weights = torch.ones_like(valid) if settings.whole_batch else valid
         weights = weights.to(warped.dtype).expand_as(warped)

@@ -17,7 +17,7 @@ from learned.losses.masks import moving
 from learned.losses.photometric import Photometric, photometric_map
 from learned.losses.smoothness import edge_aware_smoothness, mean_normalised
 from learned.losses.terms import LossTerms, masked_mean
-from learned.warping import DepthKind, project_depth, sample
+from learned.warping import WHOLE, DepthKind, project_depth, sample
 
 HIGH, LOW = (1.1, 2.0), (0.7, 0.9)
 NEVER = 1e3  # difference of a pixel that its source does not show: any other source or standing still is better
@@ -73,7 +73,7 @@ def scale_views(target: Tensor, sources: Tensor, cameras: CameraBatch, generator
         fx, fy, cx, cy = cameras.intrinsics.unbind(1)
         scaled = torch.stack([fx * ratio, fy * ratio, (cx + 0.5) * ratio - 0.5 - left,
                               (cy + 0.5) * ratio - 0.5 - top], 1)
-        return View(images[:, 0], images[:, 1:], cameras.with_intrinsics(scaled), first & (seen[:, -1:] > 0.999))
+        return View(images[:, 0], images[:, 1:], cameras.with_intrinsics(scaled), first & (seen[:, -1:] > WHOLE))
     return (view(high, left, top, False), View(target, sources, cameras, everywhere),
             view(low, nothing, nothing, True))
 
@@ -127,7 +127,8 @@ def _reprojection(view: View, depth: Tensor, T_target_source: Tensor, s: Resolut
     pixels = torch.where(where.valid, where.pixels, torch.zeros_like(where.pixels))
     sources, target = view.sources.flatten(0, 1), view.target[rows]
     warped = photometric_map(sample(sources, pixels, "border", s.mismatched_corners), target, s.photometric)
-    warped = torch.where(where.valid, warped, torch.full_like(warped, NEVER))
+    shown = where.valid & (sample(view.usable[rows].to(pixels.dtype), pixels) > WHOLE)
+    warped = torch.where(shown, warped, torch.full_like(warped, NEVER))
     still = photometric_map(sources, target, s.photometric)
     warped, still = (values.view(batch, count, *values.shape[1:]).amin(1) for values in (warped, still))
     return masked_mean(torch.minimum(warped, still), view.usable), view.usable & moving(warped, still)
@@ -136,7 +137,7 @@ def _reprojection(view: View, depth: Tensor, T_target_source: Tensor, s: Resolut
 def _shared(middle: View, other: View) -> Tensor:
     """Pixels (B, 1, H, W) bool of the middle view that the other shows too."""
     pixels = _matching_pixels(other.cameras, middle.cameras).detach()
-    seen = sample(other.usable.to(pixels.dtype), pixels) > 0.999
+    seen = sample(other.usable.to(pixels.dtype), pixels) > WHOLE
     return middle.usable & seen & other.cameras.contains(pixels)[:, None]
 
 

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from torch import Tensor
 
-from learned.losses.terms import masked_mean
+from learned.losses.terms import full_precision, masked_mean
 
 LEAST_MEAN = 1e-7
 
 
 def mean_normalised(field: Tensor) -> Tensor:
     """Field (B, 1, H, W) over its mean per image, so that shrinking it makes it no smoother (the paper's d*)."""
+    field = full_precision(field)
     return field / field.mean((2, 3), keepdim=True).clamp(min=LEAST_MEAN)
 
 
@@ -22,6 +23,7 @@ def edge_aware_smoothness(field: Tensor, guide: Tensor, usable: Tensor | None = 
         guide: (B, G, H, W) image whose edges let the field jump; the mean of its channels' slopes counts.
         usable: (B, 1, H, W) bool; slopes between two usable pixels count.
     """
+    field, guide = full_precision(field), full_precision(guide)
     total = field.new_zeros(())
     for axis in (3, 2):
         slope, edge = _steps(field, axis).abs(), _steps(guide, axis).abs().mean(1, keepdim=True)

@@ -46,10 +46,11 @@ class Snippet:
             raise ConfigError(f"losses: images of {width} x {height} pixels cannot be halved; use fewer pyramid levels "
                               "or a size that is a multiple of a higher power of two")
         known = self.depth > 0
-        nearness = torch.where(known, 1 / torch.where(known, self.depth, torch.ones_like(self.depth)), 0.0)
+        nearness = _halved(torch.where(known, 1 / torch.where(known, self.depth, 1.0), 0.0))
+        depth = torch.where(nearness > 0, 1 / torch.where(nearness > 0, nearness, 1.0), 0.0)
         usable = self.usable
         return replace(
-            self, images=_halved(self.images), depth=1 / _halved(nearness).clamp(min=1e-12),
+            self, images=_halved(self.images), depth=depth,
             cameras=self.cameras.resized(width // 2, height // 2),
             usable=None if usable is None else _halved(usable.to(self.images.dtype)) > 0.999)
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 
+import torch
 from torch import Tensor
 
 
@@ -16,6 +17,11 @@ class LossTerms:
     """Scalar to minimise, weights applied."""
     parts: Mapping[str, Tensor]
     """Scalars by name, before their weights and without gradient, for logs."""
+
+
+def full_precision(values: Tensor) -> Tensor:
+    """The values in float32 if they come in half precision: variances and logarithms do not survive eight bits."""
+    return values.float() if values.dtype in (torch.float16, torch.bfloat16) else values
 
 
 def masked_mean(values: Tensor, mask: Tensor) -> Tensor:

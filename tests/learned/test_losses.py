@@ -77,6 +77,17 @@ def test_per_channel_light_needs_per_channel_gains_and_parity_goes_the_wrong_way
                                                                    Photometric()) - pair).abs().max() < 1e-9
 
 
+def test_half_precision_of_a_network_does_not_reach_the_terms():
+    a, b = images(8, 1, 3, 8, 8), images(9, 1, 3, 8, 8)
+    half_a, half_b = a.bfloat16(), b.bfloat16()
+    exact = half_a.float(), half_b.float()
+    mask = torch.ones(1, 1, 8, 8, dtype=torch.bool)
+    for term in (lambda x, y: photometric_map(x, y, Photometric()), lambda x, y: compare(x, y, mask, Photometric())[0],
+                 lambda x, y: edge_aware_smoothness(mean_normalised(x[:, :1]), y), lambda x, y: unit_depth(x[:, :1]),
+                 depth_like_light, lambda x, y: depth_from_light(y)):
+        torch.testing.assert_close(term(half_a, half_b), term(*exact), atol=0, rtol=0)
+
+
 def test_a_flat_or_empty_image_gives_no_nan():
     flat, target = torch.full((1, 3, 6, 6), 0.3, requires_grad=True), images(4, 1, 3, 6, 6).float()
     for mask in (torch.ones(1, 1, 6, 6, dtype=torch.bool), torch.zeros(1, 1, 6, 6, dtype=torch.bool)):
