@@ -15,7 +15,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from learned.camera_rays import CameraBatch, pixel_grid
-from learned.losses.photometric import Photometric, photometric_map
+from learned.losses.photometric import Photometric, countable, photometric_map
 from learned.losses.smoothness import edge_aware_smoothness, mean_normalised
 from learned.losses.terms import LossTerms, full_precision, masked_mean
 from learned.warping import WHOLE, DepthKind, project_depth, sample
@@ -116,7 +116,8 @@ def appearance_loss(target: Tensor, sources: Tensor, depths: Sequence[Tensor], d
         where = project_depth(depth[rows], T_target_source.flatten(0, 1), views, settings.depth_kind)
         pixels = torch.where(where.valid, where.pixels, torch.zeros_like(where.pixels))
         warped = sample(sources.flatten(0, 1), pixels, "border", settings.mismatched_corners)
-        counted = visible & where.valid & (sample(whole.to(pixels.dtype), pixels) > WHOLE)
+        shown = whole & where.valid & (sample(whole.to(pixels.dtype), pixels) > WHOLE)
+        counted = visible & countable(shown, settings.photometric)  # visible has pores where the view grows
         change = full_precision(change).flatten(0, 1)
         refined = (wide + visible * change).clamp(0, 1)
         guide = F.interpolate(target, disparity.shape[-2:], mode="area")

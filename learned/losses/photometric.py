@@ -97,7 +97,12 @@ def compare(warped: Tensor, target: Tensor, valid: Tensor, settings: Photometric
     """
     if settings.match_brightness:
         warped = match_brightness(warped, target, valid, settings)
-    return photometric_map(warped, target, settings), whole_windows(valid) if settings.only_whole_windows else valid
+    return photometric_map(warped, target, settings), countable(valid, settings)
+
+
+def countable(valid: Tensor, settings: Photometric) -> Tensor:
+    """Of valid pixels (B, 1, H, W) bool those whose photometric difference counts."""
+    return whole_windows(valid) if settings.only_whole_windows else valid
 
 
 def _moments(image: Tensor, weights: Tensor, over: tuple[int, ...], count: Tensor) -> tuple[Tensor, Tensor]:

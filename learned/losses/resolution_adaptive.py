@@ -14,7 +14,7 @@ from torch import Tensor
 
 from learned.camera_rays import CameraBatch
 from learned.losses.masks import moving
-from learned.losses.photometric import Photometric, photometric_map
+from learned.losses.photometric import Photometric, countable, photometric_map
 from learned.losses.smoothness import edge_aware_smoothness, mean_normalised
 from learned.losses.terms import LossTerms, masked_mean
 from learned.warping import WHOLE, DepthKind, project_depth, sample
@@ -128,10 +128,11 @@ def _reprojection(view: View, depth: Tensor, T_target_source: Tensor, s: Resolut
     sources, target = view.sources.flatten(0, 1), view.target[rows]
     warped = photometric_map(sample(sources, pixels, "border", s.mismatched_corners), target, s.photometric)
     shown = where.valid & (sample(view.usable[rows].to(pixels.dtype), pixels) > WHOLE)
-    warped = torch.where(shown, warped, torch.full_like(warped, NEVER))
+    warped = torch.where(countable(shown, s.photometric), warped, torch.full_like(warped, NEVER))
     still = photometric_map(sources, target, s.photometric)
     warped, still = (values.view(batch, count, *values.shape[1:]).amin(1) for values in (warped, still))
-    return masked_mean(torch.minimum(warped, still), view.usable), view.usable & moving(warped, still)
+    counted = countable(view.usable, s.photometric)
+    return masked_mean(torch.minimum(warped, still), counted), counted & moving(warped, still)
 
 
 def _shared(middle: View, other: View) -> Tensor:

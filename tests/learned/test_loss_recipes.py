@@ -56,6 +56,14 @@ def test_the_paper_adds_its_terms_with_its_weights(scene):
     assert float(summed.parts["smoothness"]) == pytest.approx(3 * float(p["smoothness"]), rel=1e-9)
 
 
+def test_pixels_whose_depths_disagree_count_less(scene):
+    snippet = scene.snippet("range", {(1, 2): scene.T(1, 2)})
+    apart = dataclasses.replace(snippet, depth=snippet.depth * torch.tensor([1, 1, 1.3]).view(1, 3, 1, 1, 1))
+    weighed, plain = (float(consistency_loss(apart, Consistency(depth_kind="range", weigh_by_agreement=weigh))
+                            .parts["photometric"]) for weigh in (True, False))
+    assert weighed == pytest.approx(plain * (1 - 0.3 / 2.3), rel=1e-3)
+
+
 def test_a_change_of_light_costs_nothing_once_brightness_is_matched(scene):
     snippet = scene.snippet("range")
     recipe = Consistency(depth_kind="range")
@@ -239,6 +247,31 @@ def test_the_better_source_counts_and_a_still_one_gives_no_gradient(scene):
     loss = ra.resolution_adaptive_loss(frozen, disparities, guess, T, recipe)
     loss.total.backward()  # a capsule at rest: nothing to learn, and nothing but the auto-mask says so
     assert all((g.grad == 0).all() for g in guess) and float(loss.parts["middle"]) == 0
+
+
+def test_what_is_not_usable_is_seen_neither_in_target_nor_in_sources(scene):
+    recipe = ra.ResolutionAdaptive(depth_kind="range")
+    usable = torch.ones(1, 1, 64, 64, dtype=torch.bool)
+    usable[..., 25:40, 25:40] = False
+    noise = torch.rand(3, 3, 64, 64, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+    images = torch.where(usable, scene.images, noise)
+    depths, T = (scene.range[[1]],) * 3, torch.stack([scene.T(1, 0), scene.T(1, 2)], 1)
+    lost = {}
+    for name, mask, frames in (("clean", usable, scene.images), ("masked", usable, images), ("seen", None, images)):
+        views = ra.scale_views(frames[[1]], frames[None, [0, 2]], scene.cameras, torch.Generator().manual_seed(0), mask)
+        terms = ra.resolution_adaptive_loss((views[1],) * 3, (1 / depths[0],) * 3, depths, T, recipe)
+        lost[name] = float(terms.parts["middle"])
+        if mask is not None:
+            assert not views[0].usable.all() and views[2].usable.float().mean() < usable.float().mean()
+    assert lost["masked"] == pytest.approx(lost["clean"], rel=1e-4) and lost["seen"] > 3 * lost["masked"]
+    inputs = appearance_inputs(scene)
+    still = inputs["registered"].image
+    for name, frames in (("clean", scene.images), ("masked", images)):
+        spoiled = inputs | {"target": frames[[1]], "sources": frames[None, [0, 2]]}
+        terms = af.appearance_loss(**spoiled | {"registered": dataclasses.replace(inputs["registered"], image=still)},
+                                   usable=usable, settings=RANGE)
+        lost[name] = float(terms.parts["photometric"])
+    assert lost["masked"] == pytest.approx(lost["clean"], rel=1e-4)
 
 
 def test_parity_mixes_the_masks_of_a_batch(scene, scene_of):

@@ -85,6 +85,9 @@ def test_glass_only_moves_pixels_before_it_blurs():
         out = corrupt(image, "glass_blur", severity, np.random.default_rng(4))
         assert out.mean() == pytest.approx(image.mean(), abs=0.6)
         assert distance(image, out) > distance(image, corrupt(image, "gaussian_blur", 1, np.random.default_rng(4))) / 2
+        sigma = PARAMETERS["glass_blur"][severity - 1][0]
+        unmoved = cv2.GaussianBlur(image, (0, 0), sigma * 2**0.5)  # what both blurs do without the swaps
+        assert distance(unmoved, out) > 0.5 * severity**0.5
     flat = np.full((30, 30, 3), 91, np.uint8)
     assert (corrupt(flat, "glass_blur", 5, np.random.default_rng(0)) == 91).all()
 
