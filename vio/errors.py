@@ -51,6 +51,10 @@ class TrackingError(VioError):
     """Images or tracks from which no motion can be measured."""
 
 
+class CorruptionError(VioError):
+    """A corruption or sensor fault that does not exist, or that the data at hand cannot suffer."""
+
+
 class SimulationError(VioError):
     """A simulation that was asked for the impossible."""
 
