@@ -84,7 +84,7 @@ class Textures:
         surface, deep = self._vessels(k, first, rows)
         tissue, blood = 0.13 * mid + 0.045 * fine, look.vessel_density * (surface + deep)
         if look.villi:
-            tissue += 0.16 * np.tanh(-grain)
+            tissue += 0.10 * np.tanh(-grain)
             relief_mm = look.relief_mm[0] * np.tanh(1.5 * grain) + look.relief_mm[1] * mid
         else:
             share = 0.02 if self._organ.folds == "haustral" else 0.05
