@@ -41,11 +41,12 @@ def read_image_folder(path: str | Path, declared: Declared | None = None) -> Rec
     """
     root = Path(path)
     table = read_named_table(root / TABLE)
+    t_ns = table.times_ns()
     files = tuple(inside(root, name, table.table.at(k)) for k, name in enumerate(table.texts("filename")))
     missing = next((k for k, file in enumerate(files) if not file.is_file()), None)
     if missing is not None:
         raise FormatError(f"{table.table.at(missing)}: there is no file {files[missing].name!r} below the recording's "
                           "folder; restore it or drop the row")
     imu, calibration = read_sidecar(root, declared or Declared())
-    return Recording(root.name, table.times_ns(), imu, calibration, frame_paths=files,
+    return Recording(root.name, t_ns, imu, calibration, frame_paths=files,
                      provenance={"format": "images", "clock": "times as listed in frames.csv"})

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from decimal import Decimal, InvalidOperation
+from decimal import Decimal, InvalidOperation, Overflow
 from pathlib import Path
 
 import numpy as np
@@ -15,6 +15,7 @@ from vio.errors import FormatError, VioError
 
 Array = NDArray[np.float64]
 QUATERNION_TOLERANCE = 1e-3
+LARGEST_NS = 2**62  # so that no difference of two overflows; 146 years
 
 
 @dataclass(frozen=True)
@@ -134,9 +135,13 @@ def parse_times(
     stamps = np.empty(len(fields), np.int64)
     for k, field in enumerate(fields):
         try:
-            stamps[k] = round(Decimal(field.strip()) * ns_per_unit)
-        except (InvalidOperation, ValueError, OverflowError):
-            raise error(f"{table.at(k)}: time {field.strip()!r} is not a number; write decimals with a point") from None
+            exact = Decimal(field.strip()) * ns_per_unit
+        except (InvalidOperation, Overflow):
+            exact = Decimal("nan")
+        if not (exact.is_finite() and -LARGEST_NS < exact < LARGEST_NS):
+            raise error(f"{table.at(k)}: time {field.strip()[:40]!r} is no number of 64 bits in nanoseconds; write "
+                        "decimals with a point")
+        stamps[k] = round(exact)
     keep = np.ones(len(stamps), bool)
     if repair:
         keep[1:] = stamps[1:] != stamps[:-1]
