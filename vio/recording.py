@@ -155,7 +155,7 @@ class Recording:
         if camera is not None and (width, height) != (camera.width, camera.height):
             where = f"frame {k}" if path is None else f"frame {k} ({path.name})"
             raise RecordingError(f"{where} has {width} x {height} pixels but the camera {camera.width} x "
-                                 f"{camera.height}; correct `resolution` and `intrinsics` in cam0/sensor.yaml")
+                                 f"{camera.height}; correct the camera's `resolution` and `intrinsics`")
         return image
 
     def depth_m(self, k: int) -> NDArray[np.float32] | None:
