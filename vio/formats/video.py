@@ -85,10 +85,12 @@ def _listed_times(table: Path, film: Path, shown_s: NDArray[np.float64]) -> NDAr
                              f"{OPTIONS['presentation_times']}")
     t_ns = read_named_table(table).times_ns()
     if len(t_ns) != len(shown_s):
-        usable = min(_before_hole(shown_s), len(t_ns))
+        before_hole = _before_hole(shown_s)
+        usable = min(before_hole, len(t_ns))
+        sure = "a hole follows" if before_hole < len(shown_s) else "if only the end is missing; no hole shows"
         raise RecordingError(f"{film.name}: {len(shown_s)} frames decode, but {table.name} lists {len(t_ns)} times; "
-                             f"frames 0 to {usable - 1} can be used: cut the film and the table to {usable}, or "
-                             "restore the film")
+                             f"frames 0 to {usable - 1} can be used ({sure}): cut the film and the table to {usable}, "
+                             "or restore the film")
     return t_ns
 
 
