@@ -64,7 +64,8 @@ def statistics(images: list[np.ndarray]) -> dict[str, np.ndarray | float]:
         bright.append(np.mean(grey[lit] > 0.95))
         dark.append(np.mean(grey[lit] < 0.1))
     return {"brightness": np.concatenate(brightness), "gradient": np.concatenate(gradient),
-            "colour": np.mean(colour, axis=0), "saturated": 100 * float(np.mean(bright)), "dark": 100 * float(np.mean(dark))}
+            "colour": np.mean(colour, axis=0), "saturated": 100 * float(np.mean(bright)),
+            "dark": 100 * float(np.mean(dark))}
 
 
 def describe(name: str, found: dict, references: dict[str, dict]) -> list[str]:
@@ -87,4 +88,5 @@ if __name__ == "__main__":
     record("looks", "Looks: image statistics beside other endoscopy",
            "Earth mover's distances of brightness (0 to 1) and of log10 gradient magnitude (per pixel at 320 pixels "
            "across). None of the references is a capsule in a living gut: the only real one is a sinus under a strong "
-           "lamp, the others are simulators. So the distance between references is the yardstick.\n\n" + table(header, rows))
+           "lamp, the others are simulators. So the distance between references is the yardstick.\n\n"
+           + table(header, rows))
