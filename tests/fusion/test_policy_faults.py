@@ -165,7 +165,7 @@ def test_what_was_spoiled_is_what_was_refused(case):
 
 def test_clipped_samples_widen_their_intervals_only(examine):
     """A gyro whose range the tumbles exceed in 1 % of the samples."""
-    whole, clipped = (examine("stomach", "none", 0, 60.0, 12, noise=replace(SIMULATED_IMU, gyro_range_rad_s=full_scale))
+    whole, clipped = (examine("stomach", "none", 0, 60.0, 16, noise=replace(SIMULATED_IMU, gyro_range_rad_s=full_scale))
                       for full_scale in (35.0, 0.9))
     at_limit = (np.abs(clipped.recording.imu.gyro_rad_s) >= 0.9).any(axis=1)
     assert 0.01 < at_limit.mean() < 0.02
