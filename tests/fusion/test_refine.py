@@ -204,10 +204,10 @@ def test_a_gap_in_the_imu_is_listed_and_widens_what_was_not_seen(examination, co
     def turn_sd(trajectory):
         """Uncertainty that a stretch adds to the attitude."""
         total = np.sqrt((sd_of(trajectory)[:, :3] ** 2).sum(axis=1))
-        return np.sqrt(total[after] ** 2 - total[before] ** 2)
+        return np.sqrt(max(total[after] ** 2 - total[before] ** 2, 0.0))  # gravity may make it smaller
 
     whole = refine(examination.recording, examination.motions, config)
-    assert turn_sd(result.trajectory) > 5 * turn_sd(whole.trajectory)
+    assert turn_sd(result.trajectory) > max(5 * turn_sd(whole.trajectory), 1e-3)
     # The motions bridge it: their rotations are known to 0.3 degrees each, within a factor for the reported sd.
     assert np.deg2rad(0.3) < turn_sd(result.trajectory) < np.deg2rad(5)
 
