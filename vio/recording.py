@@ -144,11 +144,7 @@ class Recording:
         path = self.depth_paths[self._index(k)]
         if path is None:
             return None
-        counts = _decode(path, f"depth of frame {k}", depth=True)
-        if counts.dtype != np.uint16 or counts.ndim != 2:
-            raise RecordingError(f"depth of frame {k} ({path.name}) is {counts.dtype} with shape {counts.shape}; "
-                                 "give a 16-bit image with one channel")
-        return (counts * np.float32(self.depth_unit_m)).astype(np.float32)
+        return read_depth_image(path, f"depth of frame {k}", self.depth_unit_m)
 
     def truth_at_frames(self) -> Trajectory:
         """Truth interpolated at the times of the frames that it covers.
@@ -186,6 +182,19 @@ def check_refinable(recording: Recording) -> Recording:
                              "stream that covers all frames (imu0/data.csv)")
     check_coverage(recording.imu_t_s, recording.frame_t_s)
     return recording
+
+
+def read_depth_image(path: Path, what: str, unit_m: float) -> NDArray[np.float32]:
+    """z-depth (H, W) of a 16-bit image in metres, 0 where unknown; `what` names it in messages.
+
+    Raises:
+        RecordingError: the file is absent, cut off, undecodable or not 16-bit.
+    """
+    counts = _decode(path, what, depth=True)
+    if counts.dtype != np.uint16 or counts.ndim != 2:
+        raise RecordingError(f"{what} ({path.name}) is {counts.dtype} with shape {counts.shape}; "
+                             "give a 16-bit image with one channel")
+    return (counts * np.float32(unit_m)).astype(np.float32)
 
 
 def _decode(path: Path, what: str, depth: bool) -> NDArray[Any]:

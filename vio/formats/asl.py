@@ -158,17 +158,26 @@ def _read_depth(sensor: Path, frame_t_ns: NDArray[np.int64]) -> tuple[tuple[Path
     """Depth file of every frame (matched by equal stamps) and metres per count."""
     if not (sensor / "data.csv").is_file():
         return (), 1e-3
-    name = short_name(sensor / "sensor.yaml")
-    unit_m = number(load_yaml(sensor / "sensor.yaml"), "depth_unit_m", name)
-    if unit_m <= 0:
-        raise CalibrationError(f"{name}: depth_unit_m is {unit_m:g}, must be positive metres")
-    t_ns, files = _read_listing(sensor)
+    t_ns, files, unit_m = read_depth_listing(sensor)
     stray = ~np.isin(t_ns, frame_t_ns)
     if stray.any():
         raise FormatError(f"{short_name(sensor / 'data.csv')}: stamp {t_ns[np.argmax(stray)]} is no frame of cam0; "
                           "depth images carry the stamp of their frame")
     by_stamp = dict(zip(t_ns.tolist(), files, strict=True))
     return tuple(by_stamp.get(t) for t in frame_t_ns.tolist()), unit_m
+
+
+def read_depth_listing(sensor: Path) -> tuple[NDArray[np.int64], tuple[Path, ...], float]:
+    """Stamps (N,) and files of a folder of depth images laid out as `mav0/depth0`, and metres per count.
+
+    Raises:
+        VioError: `data.csv` or `sensor.yaml` is missing or unusable, naming file and line.
+    """
+    name = short_name(sensor / "sensor.yaml")
+    unit_m = number(load_yaml(sensor / "sensor.yaml"), "depth_unit_m", name)
+    if unit_m <= 0:
+        raise CalibrationError(f"{name}: depth_unit_m is {unit_m:g}, must be positive metres")
+    return *_read_listing(sensor), unit_m
 
 
 def _read_provenance(path: Path) -> dict[str, Any]:

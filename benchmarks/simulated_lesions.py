@@ -1,0 +1,123 @@
+"""Lesions with known places in simulated recordings: the lumen behind a simulated motion, and what a camera sees of it.
+
+Only `true_lumen` knows how the simulator makes its path; everything else works on what it returns.
+"""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.interpolate import PchipInterpolator, make_interp_spline
+
+from vio.simulation import ORGANS, Simulation, path
+
+Array = NDArray[np.float64]
+
+LUMEN_RADIUS_M = {"small-bowel": 12e-3, "colon": 20e-3}
+FARTHEST_M = 60e-3
+
+
+@dataclass(frozen=True)
+class Lumen:
+    """The course of the gut that a simulated capsule follows."""
+
+    arc_m: Array
+    """(L,) arc lengths along the centreline, every half millimetre."""
+    points_m: Array
+    """(L, 3) in the simulator's world."""
+    first_arc_m: float
+    """Where the capsule is in the first frame."""
+    frame_arc_m: Array
+    """(M,) where it is in every frame."""
+
+
+@dataclass(frozen=True)
+class SimulatedLesion:
+    """A spot on the wall of the lumen, as one frame shows it."""
+
+    frame: int
+    pixel: tuple[float, float]
+    depth_m: float
+    """z-depth of the spot in that frame."""
+    arc_m: float
+    """True arc length from the first frame."""
+    point_m: Array
+    """(3,) in the simulator's world."""
+
+
+def true_lumen(simulation: Simulation) -> Lumen:
+    """The centreline behind a simulation and the capsule's course along it, drawn again from its seed."""
+    facts, t = simulation.recording.provenance, simulation.recording.frame_t_s
+    shape, rng = ORGANS[facts["organ"]], np.random.default_rng([facts["seed"], 1])
+    knots = np.arange(-path.MARGIN_S, simulation.recording.duration_s + path.MARGIN_S + path.KNOT_SPACING_S,
+                      path.KNOT_SPACING_S)
+    course = path._course(knots, path._PHASES[facts["driving"]], shape.speed_factor, rng)
+    node_arc, nodes, _ = path._centreline(shape, float(course.max()), rng)
+    arc = np.arange(node_arc[0], node_arc[-1], 5e-4)
+    points = make_interp_spline(node_arc, nodes, k=5)(arc)
+    frame_arc = PchipInterpolator(knots, course)(t)
+    return Lumen(arc, points, nearest_arc(arc, points, simulation.recording.truth.positions_m[0], float(frame_arc[0])),
+                 frame_arc)
+
+
+def nearest_arc(arc: Array, points: Array, point: Array, near: float, reach_m: float = 0.08) -> float:
+    """Arc length of the place on a line that is nearest to a point, looked for around an arc length."""
+    window = np.flatnonzero(np.abs(arc - near) < reach_m)
+    return float(arc[window[np.argmin(np.linalg.norm(points[window] - point, axis=1))]])
+
+
+def draw_lesions(simulation: Simulation, lumen: Lumen, count: int, rng: np.random.Generator) -> list[SimulatedLesion]:
+    """Spots on the wall of the travelled path that random frames see at random pixels, spread over the recording."""
+    radius = LUMEN_RADIUS_M[simulation.recording.provenance["organ"]]
+    camera, frames = simulation.recording.calibration.camera, len(simulation.recording)
+    low, high = lumen.frame_arc_m.min() + 5e-3, lumen.frame_arc_m.max() - 5e-3
+    found: list[SimulatedLesion] = []
+    for k in range(200 * count):
+        if len(found) == count:
+            break
+        edges = np.linspace(0, frames, count + 1)
+        frame = int(rng.uniform(edges[len(found)], edges[len(found) + 1])) if k % 40 < 30 else int(rng.integers(frames))
+        pixel = rng.uniform([60, 60], [camera.width - 60, camera.height - 60])
+        spot = see_wall(simulation, lumen, radius, frame, pixel)
+        if spot is not None and low < spot.arc_m + lumen.first_arc_m < high:
+            found.append(spot)
+    return found
+
+
+def see_wall(simulation: Simulation, lumen: Lumen, radius_m: float, frame: int, pixel: Array) -> SimulatedLesion | None:
+    """Follow the ray of a pixel to the wall of a tube around the centreline; None where it ends nowhere near."""
+    calibration = simulation.recording.calibration
+    T = simulation.recording.truth.T_world_body[frame] @ calibration.T_body_camera
+    ray = calibration.camera.unproject(pixel)
+    steps = np.arange(0.0, FARTHEST_M, 2.5e-4)
+    points = T[:3, 3] + np.outer(steps, T[:3, :3] @ ray)
+    window = np.abs(lumen.arc_m - lumen.frame_arc_m[frame]) < 0.1
+    off = np.linalg.norm(points[:, None] - lumen.points_m[window][None, ::4], axis=2).min(axis=1)
+    if off[0] >= radius_m or not (off >= radius_m).any():
+        return None
+    hit = int(np.argmax(off >= radius_m))
+    arc = nearest_arc(lumen.arc_m, lumen.points_m, points[hit], float(lumen.frame_arc_m[frame]))
+    return SimulatedLesion(frame, (float(pixel[0]), float(pixel[1])), float(steps[hit] * ray[2]),
+                           arc - lumen.first_arc_m, points[hit])
+
+
+def write_depth(folder: Path, simulation: Simulation, maps: dict[int, float], unit_m: float = 1e-5) -> None:
+    """A folder of predicted depth maps, each flat at the depth that its frame shows at its lesion."""
+    import cv2
+    import yaml
+
+    (folder / "data").mkdir(parents=True)
+    camera, stamps = simulation.recording.calibration.camera, simulation.recording.frame_t_ns
+    rows = ["#timestamp [ns],filename"]
+    for frame in sorted({0, *maps}):
+        counts = np.full((camera.height, camera.width), round(maps.get(frame, 0.0) / unit_m), np.uint16)
+        cv2.imwrite(str(folder / "data" / f"{stamps[frame]}.png"), counts)
+        rows.append(f"{stamps[frame]},{stamps[frame]}.png")
+    (folder / "data.csv").write_text("\n".join(rows) + "\n", encoding="utf-8")
+    sensor = yaml.safe_dump({"sensor_type": "depth", "depth_unit_m": unit_m})
+    (folder / "sensor.yaml").write_text(sensor, encoding="utf-8")
+    (folder / "prediction.json").write_text(json.dumps({"source": "simulated"}) + "\n", encoding="utf-8")
