@@ -6,14 +6,14 @@ Only `true_lumen` knows how the simulator makes its path; everything else works 
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import PchipInterpolator, make_interp_spline
 
-from vio.simulation import ORGANS, Simulation, path
+from vio.simulation import ORGANS, NetworkMotions, Simulation, path
 
 Array = NDArray[np.float64]
 
@@ -105,17 +105,52 @@ def see_wall(simulation: Simulation, lumen: Lumen, radius_m: float, frame: int, 
                            arc - lumen.first_arc_m, points[hit])
 
 
-def write_depth(folder: Path, simulation: Simulation, maps: dict[int, float], unit_m: float = 1e-5) -> None:
-    """A folder of predicted depth maps, each flat at the depth that its frame shows at its lesion."""
+def sightings_of(simulation: Simulation, lesion: SimulatedLesion, around: int) -> list[SimulatedLesion]:
+    """The same spot in the frames around the one it was found in, wherever it lies in the picture."""
+    calibration, seen = simulation.recording.calibration, []
+    for frame in range(max(lesion.frame - around, 0), min(lesion.frame + around + 1, len(simulation.recording))):
+        T = simulation.recording.truth.T_world_body[frame] @ calibration.T_body_camera
+        point = T[:3, :3].T @ (lesion.point_m - T[:3, 3])
+        pixel, valid = calibration.camera.project(point)
+        inside = bool(valid) and 5e-3 < point[2] < FARTHEST_M and bool(calibration.camera.contains(pixel))
+        if frame == lesion.frame or inside:
+            seen.append(replace(lesion, frame=frame, pixel=(float(pixel[0]), float(pixel[1])), depth_m=float(point[2])))
+    return seen
+
+
+def network_depths(simulation: Simulation, network: NetworkMotions, groups: list[list[SimulatedLesion]],
+                   relative_sd: float, rng: np.random.Generator) -> list[tuple[int, tuple[float, float], float]]:
+    """(frame, pixel, depth [m] at the prior scale) as a network would report for every sighting of every lesion.
+
+    Half of the variance is shared by all sightings of one lesion.
+    """
+    log_scale = np.r_[network.true_log_scale, network.true_log_scale[-1]]
+    out = []
+    for group in groups:
+        shared = rng.standard_normal()
+        for seen in group:
+            error = relative_sd * np.sqrt(0.5) * (shared + rng.standard_normal())
+            scale = network.motions.scale_log_mean - log_scale[seen.frame]
+            out.append((seen.frame, seen.pixel, float(seen.depth_m * np.exp(scale + error))))
+    return out
+
+
+def write_depth(folder: Path, simulation: Simulation, depths: list[tuple[int, tuple[float, float], float]],
+                unit_m: float = 1e-5) -> None:
+    """A folder of predicted depth maps that know the depth around the given pixels alone."""
     import cv2
     import yaml
 
     (folder / "data").mkdir(parents=True)
     camera, stamps = simulation.recording.calibration.camera, simulation.recording.frame_t_ns
+    maps = {0: np.zeros((camera.height, camera.width), np.uint16)}
+    for frame, (u, v), depth_m in depths:
+        counts = maps.setdefault(frame, np.zeros((camera.height, camera.width), np.uint16))
+        row, column = round(v), round(u)
+        counts[max(row - 2, 0):row + 3, max(column - 2, 0):column + 3] = round(depth_m / unit_m)
     rows = ["#timestamp [ns],filename"]
-    for frame in sorted({0, *maps}):
-        counts = np.full((camera.height, camera.width), round(maps.get(frame, 0.0) / unit_m), np.uint16)
-        cv2.imwrite(str(folder / "data" / f"{stamps[frame]}.png"), counts)
+    for frame in sorted(maps):
+        cv2.imwrite(str(folder / "data" / f"{stamps[frame]}.png"), maps[frame])
         rows.append(f"{stamps[frame]},{stamps[frame]}.png")
     (folder / "data.csv").write_text("\n".join(rows) + "\n", encoding="utf-8")
     sensor = yaml.safe_dump({"sensor_type": "depth", "depth_unit_m": unit_m})

@@ -36,23 +36,29 @@ class JointSamples:
 
     def position_errors(self, R_world_body: Array, frames: NDArray[np.int64]) -> Array:
         """(S, F, 3) position errors in world axes [m] at some of the M frames of R_world_body (M, 3, 3)."""
-        return self._between(np.einsum("kij,skj->ski", R_world_body[self.node], self.xi[..., 3:]), frames)
+        return self._in_world(self.xi[..., 3:], R_world_body, frames)
 
     def rotation_errors(self, R_world_body: Array, frames: NDArray[np.int64]) -> Array:
         """(S, F, 3) rotation vectors of the errors in world axes [rad] at some of the M frames."""
-        return self._between(np.einsum("kij,skj->ski", R_world_body[self.node], self.xi[..., :3]), frames)
+        return self._in_world(self.xi[..., :3], R_world_body, frames)
 
     def scale_errors(self, frames: NDArray[np.int64]) -> Array:
         """(S, F) errors of the log scale at some of the M frames."""
-        return self._between(self.log_scale[..., None], frames)[..., 0]
+        left, right, share = self._around(frames)
+        return np.asarray((1 - share) * self.log_scale[:, left] + share * self.log_scale[:, right])
 
-    def _between(self, values: Array, frames: NDArray[np.int64]) -> Array:
-        last = len(self.node) - 1
-        right = np.minimum(np.searchsorted(self.node, frames), last)
+    def _in_world(self, part: Array, R_world_body: Array, frames: NDArray[np.int64]) -> Array:
+        left, right, share = self._around(frames)
+        ends = [np.swapaxes(np.swapaxes(part[:, k], 0, 1) @ np.swapaxes(R_world_body[self.node[k]], 1, 2), 0, 1)
+                for k in (left, right)]
+        return np.asarray((1 - share[:, None]) * ends[0] + share[:, None] * ends[1])
+
+    def _around(self, frames: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64], Array]:
+        """Checkpoints (F,), (F,) around frames, and how far (F,) these are from the one to the other."""
+        right = np.minimum(np.searchsorted(self.node, frames), len(self.node) - 1)
         left = np.maximum(right - 1, 0)
         span = np.maximum(self.node[right] - self.node[left], 1)
-        share = np.clip((frames - self.node[left]) / span, 0.0, 1.0)[:, None]
-        return np.asarray((1 - share) * values[:, left] + share * values[:, right])
+        return left, right, np.clip((frames - self.node[left]) / span, 0.0, 1.0)
 
 
 def checkpoints(frames: int) -> NDArray[np.int64]:

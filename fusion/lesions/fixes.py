@@ -177,7 +177,9 @@ def _depth(refinement: Refinement, sighting: Sighting, index: int, view: View | 
     column, row = (int(np.clip(round(float(p)), 0, size - 1)) for p, size in
                    zip(pixel, (camera.width, camera.height), strict=True))
     patch = values[max(row - PATCH, 0):row + PATCH + 1, max(column - PATCH, 0):column + PATCH + 1]
-    if not np.isfinite(_ray(camera, pixel)[0]).all() or not (patch > 0).any():
+    if not all(np.isfinite(part).all() for part in _ray(camera, pixel)):
+        return None, "no ray of the calibrated camera meets this pixel: position and arc length are those of the camera"
+    if not (patch > 0).any():
         return None, "depth is unknown at this pixel: position and arc length are those of the camera"
     known = float(np.median(patch[patch > 0]))
     if depth.predicted:
