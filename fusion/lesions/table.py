@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from fusion.lesions.measures import LEVEL, Interval
 from vio.atomic import atomic_write
-from vio.errors import FormatError
+from vio.errors import FormatError, OutputError
 
 Array = NDArray[np.float64]
 
@@ -90,14 +90,20 @@ def write_lesions(table: LesionTable, folder: str | Path) -> tuple[Path, Path]:
     """Write `lesions.csv` and `lesions.json` into a folder, each whole or not at all, and return their paths.
 
     Raises:
-        OutputError: the folder cannot be written.
+        OutputError: the folder cannot be written, or holds a `lesions.csv` that is not ours, such as the list itself.
     """
     folder = Path(folder)
+    _check_ours(folder / "lesions.csv")
     as_json = json.dumps(table.to_dict(), indent=2, allow_nan=False) + "\n"
     for name, text in (("lesions.csv", _csv(table)), ("lesions.json", as_json)):
         with atomic_write(folder / name) as file:
             file.write(text.encode())
     return folder / "lesions.csv", folder / "lesions.json"
+
+
+def _check_ours(path: Path) -> None:
+    if path.exists() and not (path.is_file() and path.read_bytes().startswith(",".join(COLUMNS).encode() + b"\n")):
+        raise OutputError(f"{path.name} exists there and was not written by capsule-vio; choose another --out")
 
 
 def read_lesions(folder: str | Path) -> list[dict[str, Any]] | None:

@@ -1,75 +1,25 @@
 """Lesions on a trajectory: where they are, how sure that is, and what is not known."""
 
-import csv
-import json
-from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
 
-from benchmarks.simulated_lesions import (
-    SimulatedLesion,
-    draw_lesions,
-    network_depths,
-    sightings_of,
-    true_lumen,
-    write_depth,
-)
-from fusion import LesionTable, Provenance, Refinement, Sighting, locate, refine, write_lesions, write_run
+from benchmarks.simulated_lesions import SimulatedLesion
+from fusion import Provenance, Sighting, locate, write_lesions, write_run
 from fusion.config import RefineConfig
 from fusion.lesions.fixes import PIXEL_SD, DepthSource, place_sighting, pose_and_scale_covariance
 from fusion.lesions.table import COLUMNS
 from vio import se3
 from vio.depth_folder import read_depth_folder
-from vio.errors import LesionError, VioError
-from vio.recording import Recording
 
 SD = 0.10
 
 
-@dataclass(frozen=True)
-class Case:
-    """A simulated recording whose lesions are known, with the depth a network would report at them."""
-
-    recording: Recording
-    refined: Refinement
-    lesions: list[SimulatedLesion]
-    groups: list[list[SimulatedLesion]]
-    depth: Path
-
-    def rows(self, merged: bool = True, labels: dict[int, str] | None = None) -> list[Sighting]:
-        """Sightings of all lesions; those with a label of their own are landmarks."""
-        named = labels or {}
-        found = []
-        for k, group in enumerate(self.groups):
-            for seen in group if merged else [s for s in group if s.frame == self.lesions[k].frame]:
-                found.append(Sighting(named.get(k, f"lesion {k}"), "landmark" if k in named else "finding", seen.frame,
-                                      None, seen.pixel, "list", id=str(k)))
-        return found
-
-    def locate(self, **options: object) -> dict[str, object]:
-        rows = self.rows(options.pop("merged", True), options.pop("labels", None))
-        table = locate(self.refined, rows, depth=self.depth, recording=self.recording, **options)
-        return {lesion.id: lesion for lesion in table.lesions}
-
-
 @pytest.fixture(scope="session")
-def case(examine: Callable, tmp_path_factory: pytest.TempPathFactory) -> Case:
-    """Small bowel, 10 lesions, each seen by up to five frames."""
-    made = examine("small-bowel", "peristalsis", 2, 150.0, 41, driving="operated")
-    rng = np.random.default_rng(41)
-    lesions = draw_lesions(made.simulation, true_lumen(made.simulation), 10, rng)
-    groups = [sightings_of(made.simulation, lesion, 2) for lesion in lesions]
-    folder = tmp_path_factory.mktemp("lesions") / "depth"
-    write_depth(folder, made.simulation, network_depths(made.simulation, made.network, groups, SD, rng))
-    return Case(made.recording, refine(made.recording, made.motions), lesions, groups, folder)
-
-
-@pytest.fixture(scope="session")
-def run(case: Case, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def run(case, tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("runs") / "RUN"
     write_run(case.refined, out, Provenance(["refine"], RefineConfig(), {}))
     return out
@@ -271,96 +221,3 @@ def test_without_joint_samples_there_is_no_interval(case):
     row = next(iter(locate(replace(case.refined, joint=None), case.rows(), depth=case.depth,
                            recording=case.recording).lesions))
     assert row.arc_m.low is row.arc_m.high is None and "refine the recording again" in row.status
-
-
-# ---- outputs ---------------------------------------------------------------------------------
-
-def table_of(case: Case, *labels: str) -> LesionTable:
-    return locate(case.refined, [Sighting(label, "finding", 20 * k, None, None, "x") for k, label in enumerate(labels)])
-
-
-def read_csv(folder: Path) -> list[dict[str, str]]:
-    with (folder / "lesions.csv").open(encoding="utf-8", newline="") as file:
-        return list(csv.DictReader(file))
-
-
-def test_output_has_the_columns_of_the_contract(case, tmp_path):
-    table = locate(case.refined, case.rows(labels={1: "Pylorus", 8: "Ileocecal valve"}), depth=case.depth,
-                   recording=case.recording)
-    write_lesions(table, tmp_path)
-    rows = read_csv(tmp_path)
-    stored = json.loads((tmp_path / "lesions.json").read_text())
-    assert stored["schema"] == 1 and stored["percent_between"] == ["Pylorus", "Ileocecal valve"]
-    assert list(rows[0]) == list(COLUMNS) and len(rows) == len(stored["lesions"]) == 10
-    for row, entry in zip(rows, stored["lesions"], strict=True):
-        for key in COLUMNS:
-            assert row[key] == "" if entry[key] is None else (
-                row[key] == entry[key] if isinstance(entry[key], str) else float(row[key]) == pytest.approx(entry[key]))
-        assert entry["sd_major_mm"] >= entry["sd_mid_mm"] >= entry["sd_minor_mm"] >= 0
-        sd = np.sqrt(np.linalg.eigvalsh(np.array(entry["cov_mm2"])))[::-1]
-        np.testing.assert_allclose(sd, [entry[f"sd_{axis}_mm"] for axis in ("major", "mid", "minor")], rtol=1e-6)
-
-
-@pytest.mark.parametrize("label", ["=1+1", "+1", "-1", "@SUM(A1)", '=HYPERLINK("http://x","y")'])
-def test_a_spreadsheet_runs_no_label(case, tmp_path, label):
-    write_lesions(table_of(case, label), tmp_path)
-    row, = read_csv(tmp_path)
-    assert row["label"] == "'" + label
-    assert json.loads((tmp_path / "lesions.json").read_text())["lesions"][0]["label"] == label
-
-
-def test_a_full_disk_leaves_what_was_there(case, tmp_path, monkeypatch):
-    write_lesions(table_of(case, "before"), tmp_path)
-    before = (tmp_path / "lesions.csv").read_bytes()
-
-    def full(*_args: object) -> None:
-        raise OSError(28, "No space left on device")
-
-    monkeypatch.setattr("vio.atomic.os.replace", full)
-    with pytest.raises(VioError, match="No space left"):
-        write_lesions(table_of(case, "after"), tmp_path)
-    assert (tmp_path / "lesions.csv").read_bytes() == before and len(list(tmp_path.iterdir())) == 2
-
-
-# ---- unusable places -------------------------------------------------------------------------
-
-@pytest.mark.parametrize(("sighting", "words"), [
-    (Sighting("x", "finding", 450, None, None, "L line 2"), "L line 2: frame 450 is outside .* frames 0 to 449"),
-    (Sighting("x", "finding", None, 151.0, None, "L line 2"), "L line 2: 151 s is outside the trajectory"),
-    (Sighting("x", "finding", None, -3.0, None, "L line 2"), "outside the trajectory"),
-    (Sighting("x", "finding", 3, None, (400.0, 3.0), "L line 2"), "pixel 400, 3 lies outside the image of 320 x 320"),
-])
-def test_places_outside_are_refused_in_one_line(case, sighting, words):
-    with pytest.raises(LesionError, match=words) as caught:
-        locate(case.refined, [sighting])
-    assert "\n" not in str(caught.value)
-
-
-def test_a_time_in_a_hole_between_frames_shows_nothing(case):
-    t = case.refined.trajectory.t_s
-    keep = (t < 20) | (t > 30)
-    gapped = replace(case.refined, trajectory=case.refined.trajectory.select(keep), joint=None,
-                     log_scale=case.refined.log_scale[keep], log_scale_sd=case.refined.log_scale_sd[keep])
-    with pytest.raises(LesionError, match=r"no frame within 0\.5 s of 25 s"):
-        locate(gapped, [Sighting("x", "finding", None, 25.0, None, "x")])
-
-
-def test_another_recording_is_refused(case, examine):
-    other = examine("colon", "none", 0, 12.0, 3).recording
-    with pytest.raises(LesionError, match="does not have the frames of the trajectory"):
-        locate(case.refined, [Sighting("x", "finding", 3, None, None, "x")], recording=other)
-
-
-@pytest.mark.parametrize("sd", [0.0, -1.0, 1.0, float("nan")])
-def test_an_impossible_depth_error_is_refused(case, sd):
-    with pytest.raises(LesionError, match="between 0 and 1"):
-        locate(case.refined, [Sighting("x", "finding", 3, None, None, "x")], depth_relative_sd=sd)
-
-
-def test_a_folder_without_depth_is_refused(case, tmp_path):
-    with pytest.raises(VioError, match=r"no data\.csv"):
-        locate(case.refined, [Sighting("x", "finding", 3, None, None, "x")], depth=tmp_path)
-    for file in ("data.csv", "sensor.yaml"):
-        (tmp_path / file).write_bytes((case.depth / file).read_bytes())
-    with pytest.raises(VioError, match=r"no prediction\.json"):
-        locate(case.refined, [Sighting("x", "finding", 3, None, None, "x")], depth=tmp_path)
