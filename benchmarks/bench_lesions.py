@@ -1,6 +1,6 @@
 """Lesions on simulated recordings: how far along the gut they are found, and whether the intervals hold the truth.
 
-    python benchmarks/bench_lesions.py                  # colon and small bowel, three vibrations, 6 held-out seeds
+    python benchmarks/bench_lesions.py                  # colon and small bowel, three vibrations, 8 held-out seeds
     python benchmarks/bench_lesions.py --seeds 1 2 3 --scenes peristalsis:3
 """
 
@@ -9,6 +9,7 @@ from __future__ import annotations
 import argparse
 import os
 import tempfile
+import zlib
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -30,8 +31,8 @@ from vio.recording import Recording
 from vio.simulation import T_BODY_CAMERA, network_like_motions, simulate
 from vio.trajectory import Trajectory
 
-HELD_OUT_SEEDS = tuple(range(701, 707))
-"""The centreline and its constants were chosen on seeds 1-8."""
+HELD_OUT_SEEDS = tuple(range(721, 729))
+"""The centreline was made on seeds 1-8; the constants of the intervals were last changed after seeds 701-706."""
 LESIONS, DEPTH_SD, AROUND = 20, 0.10, 2
 CHI2_3_95 = 7.815
 
@@ -66,8 +67,9 @@ def run(job: tuple[str, str, int, str, int, float]) -> list[Row]:
     """Simulate one recording, refine it, and place its lesions from depth, without depth, and on the motions alone."""
     kind, organ, level, driving, seed, duration_s = job
     simulation = simulate(organ, kind, level, duration_s, seed, driving=driving)
-    recording, lumen, rng = simulation.recording, true_lumen(simulation), np.random.default_rng(seed)
-    network = network_like_motions(recording.truth, T_BODY_CAMERA, seed)
+    recording, lumen = simulation.recording, true_lumen(simulation)
+    rng = np.random.default_rng([seed, zlib.crc32(recording.name.encode()), len(driving)])  # no two share a scale
+    network = network_like_motions(recording.truth, T_BODY_CAMERA, rng)
     lesions = draw_lesions(simulation, lumen, LESIONS, rng)
     groups = [sightings_of(simulation, lesion, AROUND) for lesion in lesions]
     with tempfile.TemporaryDirectory() as folder:
@@ -218,8 +220,8 @@ def main() -> None:
     record(arguments.name, "Lesions along the gut, on simulated recordings", body(arguments, ordered))
 
 
-BODY = """{duration:g} s at 3 Hz per recording, {seeds} seeds ({first}–{last}) that no constant of the centreline was
-chosen on, {lesions} lesions each: spots on the wall of a tube around the simulated centreline (radius 12 mm in the
+BODY = """{duration:g} s at 3 Hz per recording, {seeds} seeds ({first}–{last}) that nothing was chosen
+on, {lesions} lesions each: spots on the wall of a tube around the simulated centreline (radius 12 mm in the
 small bowel, 20 mm in the colon), each seen by up to five neighbouring frames. Motions as from a network (noise,
 outliers, drifting scale: `docs/results/accuracy.md`); depth in the same drifting unit, off by 10 %, half of that
 variance shared by the sightings of one lesion. Pixels are exact. "Path" is how much of the gut was travelled, "track"

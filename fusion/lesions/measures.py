@@ -1,8 +1,9 @@
 """How far along the gut a place is: arc length, distance from landmarks, share of a span, each with a 95 % interval.
 
 Two sources of error: the trajectory's, by its samples (all places of one sample share its errors, so that distances
-between places are as certain as they really are), and the centreline's own, for a capsule does not keep to the middle
-of the gut. The latter was measured on simulated anatomy (docs/results/lesions.md).
+between places are as certain as they really are), and what samples cannot know: the centreline's own, for a capsule
+does not keep to the middle of the gut, and the estimator's scale bias. Their size was measured on simulated recordings
+(docs/results/lesions.md).
 """
 
 from __future__ import annotations
@@ -23,8 +24,10 @@ Array = NDArray[np.float64]
 LEVEL = 0.95
 WANDER_SHARE = 0.003
 """Standard deviation of a length along the line, as a share of it: the capsule cuts corners and wobbles."""
-WANDER_M = 0.7e-3
-"""Standard deviation of every place along the line: end effects of the smoothing."""
+WANDER_M = 1.5e-3
+"""Standard deviation of every place along the line: the capsule trembles, and the smoothing has its end effects."""
+SCALE_SHARE = 0.01
+"""By how much estimated scales are off beyond what they claim (docs/results/accuracy.md): it stretches every length."""
 TILT_RAD = 0.12
 """Standard deviation of the line's direction: a place beside the line slides along it by this times its distance."""
 VIEW_REACH_M = 25e-3
@@ -86,14 +89,14 @@ def _own_draws(place: Place, count: int) -> Array:
 
 def arc_interval(a: Along) -> Interval:
     """Arc length from the first frame [m]."""
-    own = np.array([WANDER_M, a.own_m, WANDER_SHARE * a.arc_m])
+    own = np.array([WANDER_M, a.own_m, WANDER_SHARE * a.arc_m, SCALE_SHARE * a.arc_m])
     return _interval(a.arc_m, a.sampled_m, own)
 
 
 def distance_interval(a: Along, landmark: Along) -> Interval:
     """How far `a` lies beyond a landmark [m]; negative before it."""
     length = a.arc_m - landmark.arc_m
-    own = np.array([a.own_m, landmark.own_m, WANDER_SHARE * length])
+    own = np.array([a.own_m, landmark.own_m, WANDER_SHARE * length, SCALE_SHARE * length])
     return _interval(length, a.sampled_m - landmark.sampled_m, own)
 
 
