@@ -27,5 +27,5 @@ $(READY): pyproject.toml
 	$(PYTHON) -m venv .venv
 	$(BIN)/python -m pip install --upgrade pip
 	$(BIN)/python -m pip install "torch>=2.6,<2.14"
-	$(BIN)/python -m pip install --editable . --group dev
+	$(BIN)/python -m pip install --editable ".[sim]" --group dev
 	@touch $@

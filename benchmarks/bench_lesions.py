@@ -221,8 +221,8 @@ def main() -> None:
 
 
 BODY = """{duration:g} s at 3 Hz per recording, {seeds} seeds ({first}–{last}) that nothing was chosen
-on, {lesions} lesions each: spots on the wall of a tube around the simulated centreline (radius 12 mm in the
-small bowel, 20 mm in the colon), each seen by up to five neighbouring frames. Motions as from a network (noise,
+on, {lesions} lesions each: spots on the wall of a tube around the simulated centreline (as wide as the organ is
+at rest), each seen by up to five neighbouring frames. Motions as from a network (noise,
 outliers, drifting scale: `docs/results/accuracy.md`); depth in the same drifting unit, off by 10 %, half of that
 variance shared by the sightings of one lesion. Pixels are exact. "Path" is how much of the gut was travelled, "track"
 how far the capsule moved. Truth is the arc length along the simulator's centreline from the first frame. Intervals

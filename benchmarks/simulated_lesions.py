@@ -11,13 +11,11 @@ from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.interpolate import PchipInterpolator, make_interp_spline
 
-from vio.simulation import ORGANS, NetworkMotions, Simulation, path
+from vio.simulation import ORGANS, NetworkMotions, Simulation
 
 Array = NDArray[np.float64]
 
-LUMEN_RADIUS_M = {"small-bowel": 12e-3, "colon": 20e-3}
 FARTHEST_M = 60e-3
 
 
@@ -50,18 +48,13 @@ class SimulatedLesion:
 
 
 def true_lumen(simulation: Simulation) -> Lumen:
-    """The centreline behind a simulation and the capsule's course along it, drawn again from its seed."""
-    facts, t = simulation.recording.provenance, simulation.recording.frame_t_s
-    shape, rng = ORGANS[facts["organ"]], np.random.default_rng([facts["seed"], 1])
-    knots = np.arange(-path.MARGIN_S, simulation.recording.duration_s + path.MARGIN_S + path.KNOT_SPACING_S,
-                      path.KNOT_SPACING_S)
-    course = path._course(knots, path._PHASES[facts["driving"]], shape.speed_factor, rng)
-    node_arc, nodes, _ = path._centreline(shape, float(course.max()), rng)
-    arc = np.arange(node_arc[0], node_arc[-1], 5e-4)
-    points = make_interp_spline(node_arc, nodes, k=5)(arc)
-    frame_arc = PchipInterpolator(knots, course)(t)
-    return Lumen(arc, points, nearest_arc(arc, points, simulation.recording.truth.positions_m[0], float(frame_arc[0])),
-                 frame_arc)
+    """The organ's centreline and the capsule's course along it."""
+    nominal, centre = simulation.motion.nominal, simulation.anatomy.centreline
+    frame_arc = nominal.arc_m(simulation.recording.frame_t_s)
+    arc = np.arange(max(frame_arc.min() - 0.1, 0.0), min(frame_arc.max() + 0.1, centre.length_m), 5e-4)
+    points = centre.position_m(arc)
+    first = nearest_arc(arc, points, simulation.recording.truth.positions_m[0], float(frame_arc[0]), 0.03)
+    return Lumen(arc, points, first, frame_arc)
 
 
 def nearest_arc(arc: Array, points: Array, point: Array, near: float, reach_m: float = 0.08) -> float:
@@ -72,7 +65,7 @@ def nearest_arc(arc: Array, points: Array, point: Array, near: float, reach_m: f
 
 def draw_lesions(simulation: Simulation, lumen: Lumen, count: int, rng: np.random.Generator) -> list[SimulatedLesion]:
     """Spots on the wall of the travelled path that random frames see at random pixels, spread over the recording."""
-    radius = LUMEN_RADIUS_M[simulation.recording.provenance["organ"]]
+    radius = ORGANS[simulation.recording.provenance["organ"]].radius_m
     camera, frames = simulation.recording.calibration.camera, len(simulation.recording)
     low, high = lumen.frame_arc_m.min() + 5e-3, lumen.frame_arc_m.max() - 5e-3
     found: list[SimulatedLesion] = []

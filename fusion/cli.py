@@ -95,18 +95,37 @@ def _doctor(arguments: argparse.Namespace) -> int:
 
 def _simulate(arguments: argparse.Namespace) -> int:
     from vio.formats.asl import write_asl
-    from vio.simulation import network_like_motions, simulate_recording
+    from vio.simulation import network_like_motions, preset_camera, simulate
+    from vio.simulation.images import write_rendered
 
-    if not arguments.no_images:
-        raise UsageError("rendered images are not part of this version; add --no-images for times, IMU and truth")
-    recording = simulate_recording(arguments.organ, arguments.vibration, arguments.level, arguments.duration,
-                                   arguments.seed)
-    write_asl(recording, arguments.out)
+    if arguments.dataset is not None:
+        return _simulate_dataset(arguments)
+    simulation = simulate(arguments.organ, arguments.vibration, arguments.level, arguments.duration, arguments.seed,
+                          driving=arguments.driving, start=arguments.start,
+                          camera=preset_camera(arguments.camera, arguments.size))
+    recording = simulation.recording
+    if arguments.no_images:
+        write_asl(recording, arguments.out)
+    else:
+        with _Progress() as progress:
+            write_rendered(simulation, arguments.out, products=arguments.products, progress=progress.count)
     if arguments.motions is not None:
         truth, T_body_camera = recording.truth_at_frames(), recording.calibration.T_body_camera
         network_like_motions(truth, T_body_camera, arguments.seed).motions.save(arguments.motions)
     print(f"{arguments.out}: {len(recording)} frames, {len(recording.imu)} inertial samples, "
           f"path {recording.truth_at_frames().path_length_m:.3f} m")
+    return 0
+
+
+def _simulate_dataset(arguments: argparse.Namespace) -> int:
+    from vio.simulation.dataset import plan, write_dataset
+
+    if arguments.no_images or arguments.motions is not None or arguments.products:
+        raise UsageError("--dataset writes images; it goes without --no-images, --motions and --products")
+    sequences = plan(arguments.dataset, arguments.seed, arguments.duration, arguments.camera, arguments.size)
+    with _Progress() as progress:
+        manifest = write_dataset(sequences, arguments.out, arguments.workers, progress.count)
+    print(f"{manifest}: {len(sequences)} sequences")
     return 0
 
 

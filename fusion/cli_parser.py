@@ -9,6 +9,10 @@ from typing import TypeAlias
 
 ORGANS = ("colon", "small-bowel", "stomach")
 VIBRATIONS = ("none", "gaussian", "peristalsis", "collision")
+DRIVING = ("natural", "operated", "brisk", "transit")
+CAMERAS = ("mirocam", "fisheye-140", "fisheye-156", "pinhole-110")
+PRODUCTS = ("normals", "albedo", "mask", "flow")
+DATASETS = ("mm-wce",)
 
 
 def build_parser() -> argparse.ArgumentParser:
@@ -55,16 +59,26 @@ def _doctor(commands: Commands) -> None:
 
 
 def _simulate(commands: Commands) -> None:
-    parser = _command(commands, "simulate", "write a simulated recording with exact truth",
-                      "simulate --organ colon --vibration collision --level 3 --duration 60 --no-images --out REC")
+    parser = _command(commands, "simulate", "write a simulated recording with exact truth, or a data set of them",
+                      "simulate --organ colon --vibration collision --level 3 --duration 60 --seed 1 --out REC")
     parser.add_argument("--organ", choices=ORGANS, default="small-bowel")
     parser.add_argument("--vibration", choices=VIBRATIONS, default="none")
     parser.add_argument("--level", type=int, default=0, help="vibration level, 0 to 5")
-    parser.add_argument("--duration", type=float, default=60.0, metavar="S", help="seconds")
+    parser.add_argument("--duration", type=float, default=60.0, metavar="S", help="seconds, of each recording")
     parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--driving", choices=DRIVING, default="natural",
+                        help="transit: as slow as in life; natural: ten times that; operated, brisk: driven through")
+    parser.add_argument("--start", type=float, metavar="SHARE", help="place in the organ to start at, 0 to 1")
+    parser.add_argument("--camera", choices=CAMERAS, default="mirocam")
+    parser.add_argument("--size", type=int, default=320, metavar="PIXELS", help="width and height of the images")
     parser.add_argument("--no-images", action="store_true", help="times, IMU and truth only")
+    parser.add_argument("--products", nargs="+", choices=PRODUCTS, default=[], metavar="PRODUCT",
+                        help=f"beside colour and depth, of {', '.join(PRODUCTS)}")
     parser.add_argument("--motions", type=Path, metavar="FILE", help="also write motions as a network would report")
-    parser.add_argument("--out", type=Path, required=True, metavar="REC")
+    parser.add_argument("--dataset", choices=DATASETS, help="write the paper's set-up: two data sets and the two "
+                                                            "kinds of vibration; goes on where it was stopped")
+    parser.add_argument("--workers", type=int, default=1, metavar="N", help="processes that render a data set")
+    parser.add_argument("--out", type=Path, required=True, metavar="DIR")
 
 
 def _inspect(commands: Commands) -> None:

@@ -15,7 +15,8 @@ from fusion.refine import refine
 from vio.errors import VioError
 from vio.simulation import network_like_motions, simulate_recording
 
-REQUIRED = ("numpy", "scipy", "opencv-python-headless", "gtsam", "filterpy", "torch", "plotly", "pyyaml")
+REQUIRED = ("numpy", "scipy", "opencv-python-headless", "gtsam", "filterpy", "torch", "safetensors", "plotly",
+            "pyyaml")
 EXTRAS = {"numba": "sim", "transformers": "foundation", "rerun-sdk": "view", "submitit": "cluster"}
 
 

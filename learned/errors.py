@@ -9,3 +9,7 @@ class WeightsError(VioError):
 
 class PredictionError(VioError):
     """A predictor whose output breaks its contract: wrong shape, or a value that is not finite."""
+
+
+class NetworkInputError(VioError):
+    """Frames or vibration that a network cannot take: wrong shape, wrong size, missing."""

@@ -16,13 +16,13 @@ from itertools import islice
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
 from learned.depth_maps import DepthMaps, depth_folder
 from learned.errors import PredictionError, WeightsError
+from learned.frames import resized_rgb
 from learned.predictor import Predictor
 from learned.windows import ImuWindows
 from vio.errors import ConfigError, RecordingError
@@ -174,12 +174,7 @@ def _load(
     recording: Recording, k: int, size: tuple[int, int] | None, expected: torch.Size | None
 ) -> torch.Tensor:
     """Frame k as (3, H, W) float32 in 0..1, R, G, B."""
-    image = recording.frame(k)
-    if size is not None and image.shape[:2] != size:
-        shrinks = size[0] < image.shape[0]
-        image = cv2.resize(image, (size[1], size[0]), interpolation=cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR)
-    if image.ndim == 2:
-        image = np.repeat(image[..., None], 3, axis=2)
+    image = resized_rgb(recording.frame(k), size)
     frame = torch.from_numpy(np.ascontiguousarray(image.transpose(2, 0, 1))).float() / 255
     if expected is not None and frame.shape != expected:
         raise RecordingError(

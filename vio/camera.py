@@ -135,9 +135,13 @@ class Camera:
     def _tangential(self) -> tuple[float, float]:
         return (self.distortion[2], self.distortion[3]) if self.model == "pinhole" else (0.0, 0.0)
 
+    @property
+    def reach(self) -> float:
+        """Largest s that maps one-to-one to an image radius: tangent for the pinhole, angle [rad] for the fisheye."""
+        return self._limit
+
     @cached_property
     def _limit(self) -> float:
-        """The largest s that maps one-to-one to an image radius."""
         k = self._radial
         slope = np.append(((2 * np.arange(len(k)) + 3) * k)[::-1], 1.0)  # of s (1 + k1 s² + ...), over s²
         roots = np.roots(slope)

@@ -55,6 +55,10 @@ class LesionError(VioError):
     """A list of lesions that cannot be placed on a trajectory."""
 
 
+class CorruptionError(VioError):
+    """A corruption or sensor fault that does not exist, or that the data at hand cannot suffer."""
+
+
 class SimulationError(VioError):
     """A simulation that was asked for the impossible."""
 

@@ -76,13 +76,14 @@ def track_images(images: Iterable[Image], settings: TrackerSettings | None = Non
 def usable_mask(grey: Image) -> Image:
     """Where corners may lie (255): away from specular highlights and from the dark vignette."""
     highlights = grey >= CLIP_LEVEL
-    vignette = _connected_to_border(grey <= DARK_LEVEL)
+    vignette = connected_to_border(grey <= DARK_LEVEL)
     bad = (highlights | vignette).astype(np.uint8)
     kernel = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * MASK_MARGIN_PX + 1, 2 * MASK_MARGIN_PX + 1))
     return np.where(cv2.dilate(bad, kernel) > 0, 0, 255).astype(np.uint8)
 
 
-def _connected_to_border(dark: NDArray[np.bool_]) -> NDArray[np.bool_]:
+def connected_to_border(dark: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Those pixels of a mask (H, W) that hang together with the image's border."""
     _, labels = cv2.connectedComponents(dark.astype(np.uint8))
     border = np.unique(np.concatenate([labels[0], labels[-1], labels[:, 0], labels[:, -1]]))
     return np.isin(labels, border[border > 0])

@@ -6,6 +6,7 @@ import pytest
 from vio import se3
 from vio.errors import SimulationError
 from vio.simulation import T_BODY_CAMERA, CapsuleMotion, network_like_motions
+from vio.simulation.anatomy import make_anatomy
 from vio.simulation.path import moving_path
 from vio.simulation.vibration import NoVibration
 from vio.trajectory import Trajectory
@@ -21,7 +22,8 @@ def error_per_motion(truth, network):
 
 @pytest.fixture(scope="module")
 def long_truth():
-    motion = CapsuleMotion(moving_path("small-bowel", "natural", 4000.0, np.random.default_rng(1)), NoVibration())
+    motion = CapsuleMotion(moving_path(make_anatomy("small-bowel", 1), "natural", 4000.0, np.random.default_rng(1)),
+                           NoVibration())
     t = np.arange(12_000) / 3
     return Trajectory(t, motion.evaluate(t).T_world_body)
 

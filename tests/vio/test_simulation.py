@@ -28,6 +28,8 @@ from vio.simulation import (
     simulate,
     simulate_recording,
 )
+from vio.simulation.anatomy import make_anatomy
+from vio.simulation.contact import find_contacts
 from vio.simulation.imu_synthesis import ImuBiases, corrupt
 from vio.simulation.path import moving_path
 from vio.simulation.scenario import START_T_NS
@@ -42,8 +44,10 @@ def rms(vectors):
 
 
 def motion_of(organ, kind, level, duration_s, seed):
-    path = moving_path(organ, "natural", duration_s, np.random.default_rng([seed, 1]))
-    return CapsuleMotion(path, make_vibration(kind, level, duration_s, seed))
+    anatomy = make_anatomy(organ, seed)
+    path = moving_path(anatomy, "natural", duration_s, np.random.default_rng([seed, 1]))
+    contacts = find_contacts(anatomy, path, duration_s) if kind == "collision" else None
+    return CapsuleMotion(path, make_vibration(kind, level, duration_s, seed, contacts))
 
 
 def digest(kind="collision", seed=7):
@@ -139,11 +143,13 @@ def test_gaussian_vibration_has_the_documented_size_and_stays_below_the_imu_nyqu
 def test_rates_and_forces_are_the_derivatives_of_the_pose(organ, kind, level):
     motion, h = motion_of(organ, kind, level, 60.0, 5), 2e-5
     t = np.random.default_rng(0).uniform(0, 60, 1500)
+    onsets = np.append(motion.vibration.kinks_s, np.inf)  # where the third derivative jumps, differences say nothing
+    t = t[np.abs(t[:, None] - onsets).min(axis=1) > 2 * h]
     before, now, after = (motion.evaluate(t + shift) for shift in (-h, 0, h))
     velocity = (after.T_world_body[:, :3, 3] - before.T_world_body[:, :3, 3]) / (2 * h)
     np.testing.assert_allclose(now.velocity_m_s, velocity, atol=1e-6)
     turn = np.swapaxes(before.T_world_body[:, :3, :3], 1, 2) @ after.T_world_body[:, :3, :3]
-    np.testing.assert_allclose(now.gyro_rad_s, se3.so3_log(turn) / (2 * h), atol=2e-5)
+    np.testing.assert_allclose(now.gyro_rad_s, se3.so3_log(turn) / (2 * h), atol=4e-5)
     lifted = (after.velocity_m_s - before.velocity_m_s) / (2 * h) + [0, 0, 9.81]
     force = np.einsum("nji,nj->ni", now.T_world_body[:, :3, :3], lifted)
     np.testing.assert_allclose(now.specific_force_m_s2, force, atol=1e-3)
@@ -225,7 +231,7 @@ def test_noise_biases_and_walks_have_their_densities():
     assert np.diff(biases.accel_m_s2, axis=0).std() == pytest.approx(3e-3 / np.sqrt(40), rel=0.02)
     first = loud.biases.accel_m_s2[0] - quiet.biases.accel_m_s2[0]
     np.testing.assert_allclose(first, quiet.biases.accel_m_s2[0], atol=3e-3)  # twice the deviation, same draw
-    assert quiet.recording.truth.path_length_m == 0
+    assert quiet.recording.truth.path_length_m < 1e-12
     state = quiet.recording.truth_state
     np.testing.assert_allclose(state.accel_bias_m_s2[0], biases.accel_m_s2[np.searchsorted(samples.t_ns, START_T_NS)],
                                atol=3e-3)
@@ -239,8 +245,8 @@ def test_saturation_clips_at_the_full_scale():
     assert samples.gyro_rad_s[0, 0] == pytest.approx(0.2, abs=0.01)
     np.testing.assert_array_equal(samples.gyro_rad_s[0, 1:], [-0.5, 0.5])
     np.testing.assert_array_equal(samples.accel_m_s2[0, 2], 2 * 9.81)
-    hit = simulate_recording("colon", "collision", 5, 60.0, 0, noise=ImuNoise(accel_range_m_s2=10.5))
-    assert np.abs(hit.imu.accel_m_s2).max() == 10.5
+    hit = simulate_recording("colon", "collision", 5, 60.0, 0, noise=ImuNoise(accel_range_m_s2=9.9))
+    assert np.abs(hit.imu.accel_m_s2).max() == 9.9
 
 
 def test_memory_of_the_imu_synthesis_grows_only_with_its_result():

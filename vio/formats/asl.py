@@ -103,21 +103,26 @@ def write_asl(recording: Recording, out: str | Path) -> None:
         OutputError: `out` exists and is not ours, or cannot be written.
     """
     with atomic_folder(out, MARKER) as folder:
-        mav0 = folder / "mav0"
-        t_ns = recording.frame_t_ns
-        rate_hz = 1e9 / float(np.median(np.diff(t_ns))) if len(t_ns) > 1 else None
-        _write_sensor(mav0 / "cam0", camera_to_asl(recording.calibration, rate_hz))
-        _write_listing(mav0 / "cam0", t_ns, recording.frame_paths)
-        _write_sensor(mav0 / "imu0", imu_to_asl(recording.calibration))
-        inertial = np.hstack([recording.imu.gyro_rad_s, recording.imu.accel_m_s2])
-        write_stamped_rows(mav0 / "imu0" / "data.csv", IMU_HEADER, recording.imu.t_ns, inertial)
-        if recording.truth is not None:
-            write_asl_truth(mav0 / TRUTH / "data.csv", recording.truth, recording.truth_state, int(t_ns[0]))
-        if recording.has_depth:
-            listed = [k for k, file in enumerate(recording.depth_paths) if file is not None]
-            _write_sensor(mav0 / "depth0", {"sensor_type": "depth", "depth_unit_m": float(recording.depth_unit_m)})
-            _write_listing(mav0 / "depth0", t_ns[listed], [recording.depth_paths[k] for k in listed])
-        (folder / MARKER).write_text(_provenance_text(recording), encoding="utf-8")
+        write_asl_files(recording, folder)
+
+
+def write_asl_files(recording: Recording, folder: Path) -> None:
+    """Write the files of `write_asl` into an existing folder, for a caller that adds more before it is whole."""
+    mav0 = folder / "mav0"
+    t_ns = recording.frame_t_ns
+    rate_hz = 1e9 / float(np.median(np.diff(t_ns))) if len(t_ns) > 1 else None
+    _write_sensor(mav0 / "cam0", camera_to_asl(recording.calibration, rate_hz))
+    _write_listing(mav0 / "cam0", t_ns, recording.frame_paths)
+    _write_sensor(mav0 / "imu0", imu_to_asl(recording.calibration))
+    inertial = np.hstack([recording.imu.gyro_rad_s, recording.imu.accel_m_s2])
+    write_stamped_rows(mav0 / "imu0" / "data.csv", IMU_HEADER, recording.imu.t_ns, inertial)
+    if recording.truth is not None:
+        write_asl_truth(mav0 / TRUTH / "data.csv", recording.truth, recording.truth_state, int(t_ns[0]))
+    if recording.has_depth:
+        listed = [k for k, file in enumerate(recording.depth_paths) if file is not None]
+        _write_sensor(mav0 / "depth0", {"sensor_type": "depth", "depth_unit_m": float(recording.depth_unit_m)})
+        _write_listing(mav0 / "depth0", t_ns[listed], [recording.depth_paths[k] for k in listed])
+    (folder / MARKER).write_text(_provenance_text(recording), encoding="utf-8")
 
 
 def _folders(path: Path) -> tuple[Path, Path]:
@@ -206,6 +211,14 @@ def _write_sensor(sensor: Path, data: dict[str, Any]) -> None:
     lines = [yaml.safe_dump({key: value}, default_flow_style=None if isinstance(value, dict | list) else False)
              for key, value in data.items()]  # one key a line, lists in brackets
     (sensor / "sensor.yaml").write_text("".join(lines), encoding="utf-8")
+
+
+def write_image_stream(sensor: Path, t_ns: NDArray[np.int64], description: dict[str, Any],
+                       suffix: str = ".png") -> Path:
+    """Start a stream of one file per stamp beside cam0: `sensor.yaml`, `data.csv`, and the empty `data`, returned."""
+    _write_sensor(sensor, description)
+    _write_listing(sensor, t_ns, [Path(f"{t}{suffix}") for t in t_ns.tolist()])
+    return sensor / "data"
 
 
 def _write_listing(sensor: Path, t_ns: NDArray[np.int64], files: Iterable[Path | None]) -> None:

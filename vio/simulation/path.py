@@ -1,14 +1,18 @@
-"""Nominal motion of a capsule: a winding centreline, a stop-and-go course along it, and tumbles.
+"""Nominal motion of a capsule through an organ: a stop-and-go course along the lumen, a place across it, and tumbles.
 
 Frames: world z up; body x along the capsule's axis towards its camera, y left, z up when lying level.
-Times are seconds after the first frame. Speeds are about ten times those of a mean transit (0.1 mm per
-frame), so that short sequences contain parallax: a choice of design, not physiology. Hence a long
-recording travels further than the gut is long, on a centreline that keeps folding in the same volume.
+Times are seconds after the first frame. Driving is
+
+* "transit": as slow as a capsule really is, most of the way in bursts that take a few percent of the time;
+* "natural": about ten times that, so that short sequences contain parallax; dwells, bursts, to and fro;
+* "operated": an operator drives it through, mostly forward (how the paper's data were made);
+* "brisk": another operator, faster, with more looking back.
+
+At a closed end of the organ the capsule turns back: every organ has the length it has, and a long course revisits.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -16,37 +20,15 @@ from numpy.typing import NDArray
 from scipy.interpolate import PchipInterpolator, make_interp_spline
 from scipy.spatial.transform import Rotation, RotationSpline
 
+from vio.simulation.anatomy import Anatomy
+from vio.simulation.centreline import HALF_CAPSULE_M
+from vio.simulation.contact import free_radius
+
 Array = NDArray[np.float64]
 
 KNOT_SPACING_S = 0.5
 MARGIN_S = 2.0  # the motion is defined this long before the first and after the last frame
-NODE_SPACING_M = 5e-3
-HALF_CAPSULE_M = 13e-3  # a capsule is 26 mm long and lies along the chord of the centreline
-
-
-@dataclass(frozen=True)
-class OrganShape:
-    """How a centreline winds and how lively a capsule is in it."""
-
-    semi_axes_m: tuple[float, float, float]
-    """Ellipsoid that the centreline is steered back into."""
-    bend_radius_m: float
-    """Typical (RMS) radius of curvature."""
-    tightest_radius_m: float
-    bend_length_m: float
-    """Arc length over which the curvature changes."""
-    speed_factor: float
-    tumble_gap_s: float
-    """Mean time between two tumbles."""
-    side_wander_m: float
-    """Standard deviation of the position across the lumen, per axis."""
-
-
-ORGANS = {
-    "colon": OrganShape((0.16, 0.07, 0.16), 0.08, 0.035, 0.08, 0.8, 20.0, 0.8e-3),
-    "small-bowel": OrganShape((0.11, 0.06, 0.10), 0.03, 0.018, 0.03, 1.0, 40.0, 0.5e-3),
-    "stomach": OrganShape((0.06, 0.05, 0.08), 0.05, 0.025, 0.05, 1.2, 10.0, 1.5e-3),
-}
+END_GAP_M = 1.1 * HALF_CAPSULE_M  # how close to a closed end the capsule's front comes
 
 # kind: probability, slowest and fastest speed along the centreline [mm/s]
 _PHASES = {
@@ -54,19 +36,26 @@ _PHASES = {
                 "burst": (0.10, 6.0, 20.0), "revisit": (0.10, -3.0, -8.0)},
     "operated": {"forward": (0.75, 2.0, 8.0), "back": (0.10, -1.0, -4.0), "dwell": (0.05, 0.0, 0.0),
                  "burst": (0.05, 6.0, 20.0), "revisit": (0.05, -3.0, -8.0)},
+    "brisk": {"forward": (0.55, 4.0, 12.0), "back": (0.20, -3.0, -9.0), "dwell": (0.05, 0.0, 0.0),
+              "burst": (0.10, 8.0, 24.0), "revisit": (0.10, -4.0, -10.0)},
+    "transit": {"forward": (0.18, 0.1, 0.5), "back": (0.06, -0.1, -0.4), "dwell": (0.72, 0.0, 0.0),
+                "burst": (0.035, 4.0, 12.0), "revisit": (0.005, -2.0, -5.0)},
 }
 DRIVING = tuple(_PHASES)
 _HEADING_WANDER_RAD = (0.20, 0.06, 0.06)  # about body x (roll), y and z, standard deviations
+_PLACE_SD = 0.9  # of the place across the lumen, in units of the room that the capsule has
+_PRESS_M = 1.0e-3  # how far a capsule that leans on the wall presses into it
 
 
 class NominalPath:
     """A pose that is twice continuously differentiable in time (position four times)."""
 
-    def __init__(self, knot_t_s: Array, positions_m: Array, rotations: Rotation) -> None:
+    def __init__(self, knot_t_s: Array, positions_m: Array, rotations: Rotation, arc_m: Array) -> None:
         self._position: Any = make_interp_spline(knot_t_s, positions_m, k=5)
         self._velocity: Any = self._position.derivative(1)
         self._acceleration: Any = self._position.derivative(2)
         self._rotation: Any = RotationSpline(knot_t_s, rotations)
+        self._arc: Any = PchipInterpolator(knot_t_s, arc_m)
 
     def position_m(self, t_s: Array, order: int = 0) -> Array:
         """World position (n, 3) [m] at times (n,), or its first or second time derivative."""
@@ -83,98 +72,78 @@ class NominalPath:
         out: Array = self._rotation(t_s, order)
         return out
 
+    def arc_m(self, t_s: Array) -> Array:
+        """Arc length of the organ's centreline beside the capsule's middle (n,) [m]: the truth of "how far along"."""
+        out: Array = self._arc(t_s)
+        return out
 
-def moving_path(organ: str, driving: str, duration_s: float, rng: np.random.Generator) -> NominalPath:
+
+def moving_path(anatomy: Anatomy, driving: str, duration_s: float, rng: np.random.Generator,
+                start: float | None = None) -> NominalPath:
     """A capsule's course through an organ, defined from 2 s before time 0 to 2 s after `duration_s`.
 
     Args:
-        organ: key of `ORGANS`.
-        driving: "natural" (peristalsis carries it: dwell, bursts, to and fro) or "operated" (mostly forward).
+        anatomy: the organ it moves in.
+        driving: one of `DRIVING`, see the module.
         duration_s: time of the last frame or later.
         rng: source of everything random.
+        start: where it starts, 0 at the organ's entrance, 1 at its exit; None draws a place from the first 60 %.
     """
-    shape = ORGANS[organ]
+    organ = anatomy.organ
+    place = rng.uniform(0.0, 0.6) if start is None else start
+    factor = organ.transit_factor if driving == "transit" else organ.speed_factor
+    low, high = 0.4 * organ.radius_m + END_GAP_M, organ.length_m - 0.4 * organ.radius_m - END_GAP_M
     t = np.arange(-MARGIN_S, duration_s + MARGIN_S + KNOT_SPACING_S, KNOT_SPACING_S)
-    arc = _course(t, _PHASES[driving], shape.speed_factor, rng)
-    node_arc, nodes, frames = _centreline(shape, float(arc.max()), rng)
-    along = RotationSpline(node_arc, frames)(arc)
-    side = shape.side_wander_m * _smooth_noise(rng, len(t), 9)
-    side[:, 0] = 0.0
-    positions = make_interp_spline(node_arc, nodes, k=5)(arc) + along.apply(side)
+    arc = _course(t, _PHASES[driving], factor, low + place * (high - low), (low, high), rng)
+    along = anatomy.centreline.frame(arc)
+    positions = _chord_middle(anatomy, arc) + along.apply(_place_across(anatomy, arc, rng))
     wander = Rotation.from_rotvec(_smooth_noise(rng, len(t), 9) * _HEADING_WANDER_RAD)
-    tumble = Rotation.from_rotvec(_tumbles(t, shape.tumble_gap_s, rng))
-    return NominalPath(t, positions, along * wander * tumble)
+    tumble = Rotation.from_rotvec(_tumbles(t, organ.tumble_gap_s, rng))
+    return NominalPath(t, positions, along * wander * tumble, arc)
 
 
-def resting_path(duration_s: float, rng: np.random.Generator) -> NominalPath:
-    """A capsule that lies still at the world's origin in a random attitude."""
+def resting_path(anatomy: Anatomy, duration_s: float, rng: np.random.Generator) -> NominalPath:
+    """A capsule that lies still in the middle of the organ, in a random attitude."""
     t = np.linspace(-MARGIN_S, duration_s + MARGIN_S, 8)
-    return NominalPath(t, np.zeros((8, 3)), Rotation.from_quat(np.tile(rng.standard_normal(4), (8, 1))))
+    arc = np.full(8, 0.5 * anatomy.organ.length_m)
+    attitude = Rotation.from_quat(np.tile(rng.standard_normal(4), (8, 1)))
+    return NominalPath(t, anatomy.centreline.position_m(arc), attitude, arc)
 
 
-def _course(t: Array, phases: dict[str, tuple[float, float, float]], factor: float, rng: np.random.Generator) -> Array:
-    """Arc length (n,) [m] at times t: phases of 1.5 to 5 s at constant speed, rounded off, never below zero."""
+def _course(t: Array, phases: dict[str, tuple[float, float, float]], factor: float, start_m: float,
+            ends_m: tuple[float, float], rng: np.random.Generator) -> Array:
+    """Arc length (n,) [m] at times t: phases of 1.5 to 5 s at constant speed, rounded off; it turns at the ends."""
     table = np.array(list(phases.values()))
     count = int(np.ceil((t[-1] - t[0]) / 1.5)) + 2
     kind = rng.choice(len(table), count, p=table[:, 0])
     speed = 1e-3 * factor * (table[kind, 1] + (table[kind, 2] - table[kind, 1]) * rng.random(count))
     length = rng.uniform(1.5, 5.0, count)
-    free = np.concatenate([[0.0], np.cumsum(speed * length)])
-    arc = free - np.minimum(np.minimum.accumulate(free), 0.0)  # a retreat ends at the start of the path
+    arc, sense = np.empty(count + 1), 1.0
+    arc[0] = start_m
+    for k, step in enumerate(speed * length):
+        arc[k + 1] = min(max(arc[k] + sense * step, ends_m[0]), ends_m[1])
+        if arc[k + 1] in ends_m:
+            sense = 1.0 if arc[k + 1] == ends_m[0] else -1.0
     out: Array = PchipInterpolator(t[0] + np.concatenate([[0.0], np.cumsum(length)]), arc)(t)
     return out
 
 
-def _centreline(shape: OrganShape, length_m: float, rng: np.random.Generator) -> tuple[Array, Array, Rotation]:
-    """Nodes every 5 mm: arc length (m,), position (m, 3), rotation-minimising frame with x along the capsule."""
-    margin = 2 * HALF_CAPSULE_M + 5 * NODE_SPACING_M
-    count = int(np.ceil((length_m + 2 * margin) / NODE_SPACING_M)) + 1
-    arc = np.arange(count, dtype=float) * NODE_SPACING_M - margin
-    nodes = _wind(shape, count, rng)
-    curve = make_interp_spline(arc, nodes, k=5)
-    inner = np.clip(arc, arc[0] + HALF_CAPSULE_M, arc[-1] - HALF_CAPSULE_M)
-    chord = curve(inner + HALF_CAPSULE_M) - curve(inner - HALF_CAPSULE_M)
-    chord /= np.linalg.norm(chord, axis=1, keepdims=True)
-    return arc, nodes, _transported_frames(chord, rng)
+def _chord_middle(anatomy: Anatomy, arc: Array) -> Array:
+    """Middle of a stiff capsule that lies in a bent lumen (n, 3): drawn towards the inside of the bend."""
+    curve = anatomy.centreline.position_m
+    ends = 0.5 * (curve(arc - HALF_CAPSULE_M) + curve(arc + HALF_CAPSULE_M))
+    return 0.5 * curve(arc) + 0.5 * ends
 
 
-def _wind(shape: OrganShape, count: int, rng: np.random.Generator) -> Array:
-    """Random curve (count, 3) of unit speed: its curvature forgets over `bend_length_m` and is bounded.
-
-    Outside the ellipsoid the curve is bent back as tightly as allowed, so it stays within about
-    two of its tightest radii of it, however long it is.
-    """
-    axes = np.array(shape.semi_axes_m)
-    keep = np.exp(-NODE_SPACING_M / shape.bend_length_m)
-    kick = rng.standard_normal((count, 3)) * np.sqrt((1 - keep**2) / 2) / shape.bend_radius_m
-    limit = 1 / shape.tightest_radius_m
-    x = np.zeros(3)
-    heading = _unit(rng.standard_normal(3))
-    bend = np.zeros(3)
-    out = np.empty((count, 3))
-    for k in range(count):
-        out[k] = x
-        bend = keep * bend + kick[k]
-        scaled = x / axes
-        if scaled @ scaled > 1 and heading @ (x / axes**2) > -0.5 * np.linalg.norm(x / axes**2):
-            bend = -limit * _unit(scaled / axes + 1e-3 * kick[k])
-        bend = bend - (bend @ heading) * heading
-        size = np.sqrt(bend @ bend)
-        if size > limit:
-            bend = bend * (limit / size)
-        heading = _unit(heading + NODE_SPACING_M * bend)
-        x = x + NODE_SPACING_M * heading
+def _place_across(anatomy: Anatomy, arc: Array, rng: np.random.Generator) -> Array:
+    """Offset (n, 3) [m] in lumen axes: it wanders through the room there is, and leans on the wall where that ends."""
+    wish = _PLACE_SD * _smooth_noise(rng, len(arc), 9)[:, 1:]
+    size = np.linalg.norm(wish, axis=1)
+    room = free_radius(anatomy, arc, np.arctan2(wish[:, 1], wish[:, 0]))
+    limited = size / (1 + size**6) ** (1 / 6)  # about `size` below 1, never above 1
+    out = np.zeros((len(arc), 3))
+    out[:, 1:] = wish * (limited * (room + _PRESS_M) / np.maximum(size, 1e-9))[:, None]
     return out
-
-
-def _transported_frames(forward: Array, rng: np.random.Generator) -> Rotation:
-    """Frames (m,) with x along `forward` (m, 3) that never twist about it: parallel transport."""
-    side = _unit(np.cross(forward[0], rng.standard_normal(3)))
-    y = np.empty_like(forward)
-    for k, x in enumerate(forward):
-        side = _unit(side - (side @ x) * x)
-        y[k] = side
-    return Rotation.from_matrix(np.stack([forward, y, np.cross(forward, y)], axis=2))
 
 
 def _tumbles(t: Array, mean_gap_s: float, rng: np.random.Generator) -> Array:
@@ -203,8 +172,3 @@ def _smooth_noise(rng: np.random.Generator, count: int, width: int) -> Array:
     kernel /= np.sqrt(kernel @ kernel)
     raw = rng.standard_normal((count + width - 1, 3))
     return np.stack([np.convolve(raw[:, c], kernel, "valid") for c in range(3)], axis=1)
-
-
-def _unit(v: Array) -> Array:
-    out: Array = v / np.sqrt(v @ v)
-    return out

@@ -18,15 +18,19 @@ from vio.camera import Camera
 from vio.errors import SimulationError
 from vio.imu import ImuNoise
 from vio.recording import Recording, TruthState
+from vio.simulation.anatomy import Anatomy, make_anatomy
+from vio.simulation.cameras import MIROCAM
+from vio.simulation.contact import find_contacts
 from vio.simulation.imu_synthesis import SIMULATED_IMU, ImuBiases, corrupt, draw_biases, ideal_imu
 from vio.simulation.motion import CapsuleMotion
-from vio.simulation.path import DRIVING, ORGANS, moving_path, resting_path
+from vio.simulation.organs import ORGANS
+from vio.simulation.path import DRIVING, moving_path, resting_path
 from vio.simulation.vibration import KINDS, MAX_LEVEL, make_vibration
 from vio.trajectory import Trajectory
 
 Array = NDArray[np.float64]
 
-SIMULATOR_VERSION = 1
+SIMULATOR_VERSION = 2
 START_T_NS = 10_000_000_000  # stamp of the first frame; the IMU starts a little before
 IMU_MARGIN_S = 0.25
 MIN_IMU_RATE_HZ = 5.0  # slower samples would reach beyond the span of the motion
@@ -36,15 +40,13 @@ CAMERA_AHEAD_M = 0.010
 T_BODY_CAMERA = se3.transform([[0, 0, 1], [-1, 0, 0], [0, -1, 0]], [CAMERA_AHEAD_M, 0, 0])
 """Camera 10 mm ahead of the IMU on the capsule's axis: camera z = body x, camera x = -body y, camera y = -body z."""
 
-MIROCAM = Camera("pinhole", 320, 320, 159.5906, 159.2241, 161.9297, 163.1686, (0.1994, -0.1279, 0.0, 0.0))
-"""MiroCam at 320×320, pinhole intrinsics published with EndoSLAM (k1, k2, p1, p2)."""
-
-
 @dataclass(frozen=True)
 class Simulation:
     """A recording with all that produced it."""
 
     recording: Recording
+    anatomy: Anatomy
+    """The organ that the capsule moves in: what a camera sees."""
     motion: CapsuleMotion
     """Continuous truth: evaluate it at any time from 2 s before the first to 2 s after the last frame."""
     biases: ImuBiases
@@ -58,6 +60,9 @@ class SimulationOptions(TypedDict, total=False):
     noise: ImuNoise
     driving: str
     mode: str
+    start: float | None
+    wall_motion: float
+    camera: Camera
     accel_bias_sd_m_s2: float
     gyro_bias_sd_rad_s: float
     name: str | None
@@ -80,6 +85,9 @@ def simulate(
     noise: ImuNoise = SIMULATED_IMU,
     driving: str = "natural",
     mode: str = "moving",
+    start: float | None = None,
+    wall_motion: float = 1.0,
+    camera: Camera = MIROCAM,
     accel_bias_sd_m_s2: float = 0.2,
     gyro_bias_sd_rad_s: float = float(np.deg2rad(0.5)),
     name: str | None = None,
@@ -97,8 +105,11 @@ def simulate(
         seed: integer ≥ 0.
         frame_rate_hz: frames per second.
         noise: IMU noise, rate and full scales.
-        driving: "natural" or "operated", see `vio.simulation.path`.
+        driving: "natural", "operated", "brisk" or "transit", see `vio.simulation.path`.
         mode: "moving", or "rest" for a capsule that lies still (the vibration still shakes it).
+        start: where in the organ it starts, 0 its entrance, 1 its exit; None = drawn from the first 60 %.
+        wall_motion: scale of the wall's contractions, 1 as in life, 0 none.
+        camera: what renders the images.
         accel_bias_sd_m_s2: standard deviation of the first accelerometer bias, per axis.
         gyro_bias_sd_rad_s: standard deviation of the first gyro bias, per axis.
         name: of the recording; made from the arguments when None.
@@ -109,6 +120,7 @@ def simulate(
             than 2 frames.
     """
     level, seed = _check_scenario(organ, vibration, level, seed, driving, mode)
+    _check_place(start, wall_motion)
     frame_count = _check_timing(duration_s, frame_rate_hz)
     _check_imu(noise, accel_bias_sd_m_s2, gyro_bias_sd_rad_s)
     frame_t_ns = START_T_NS + np.round(np.arange(frame_count) * (1e9 / frame_rate_hz)).astype(np.int64)
@@ -116,8 +128,11 @@ def simulate(
     end_s = float(frame_t_s[-1])
 
     rng = np.random.default_rng([seed, 1])
-    nominal = resting_path(end_s, rng) if mode == "rest" else moving_path(organ, driving, end_s, rng)
-    motion = CapsuleMotion(nominal, make_vibration(vibration, level, end_s, seed))
+    anatomy = make_anatomy(organ, seed, wall_motion)
+    nominal = (resting_path(anatomy, end_s, rng) if mode == "rest"
+               else moving_path(anatomy, driving, end_s, rng, start))
+    contacts = find_contacts(anatomy, nominal, end_s) if vibration == "collision" and level > 0 else None
+    motion = CapsuleMotion(nominal, make_vibration(vibration, level, end_s, seed, contacts))
     state = motion.evaluate(frame_t_s)
 
     rng = np.random.default_rng([seed, 3])
@@ -131,16 +146,17 @@ def simulate(
     provenance = {
         "schema": 1, "source": "capsule-vio simulation", "simulator_version": SIMULATOR_VERSION, "seed": seed,
         "organ": organ, "vibration": vibration, "vibration_level": level, "duration_s": float(duration_s),
-        "frame_rate_hz": float(frame_rate_hz), "driving": driving, "mode": mode,
+        "frame_rate_hz": float(frame_rate_hz), "driving": driving, "mode": mode, "start": start,
+        "wall_motion": float(wall_motion),
         "accel_bias_sd_m_s2": float(accel_bias_sd_m_s2), "gyro_bias_sd_rad_s": float(gyro_bias_sd_rad_s),
     }
     recording = Recording(
         name=name or f"{organ}-{vibration}{level}-seed{seed}", frame_t_ns=frame_t_ns, imu=samples,
-        calibration=Calibration(MIROCAM, T_BODY_CAMERA, noise), truth=Trajectory(frame_t_s, state.T_world_body),
+        calibration=Calibration(camera, T_BODY_CAMERA, noise), truth=Trajectory(frame_t_s, state.T_world_body),
         provenance=provenance,
         truth_state=TruthState(state.velocity_m_s, *_biases_at(frame_t_ns, imu_t_ns, biases)),
     )
-    return Simulation(recording, motion, biases)
+    return Simulation(recording, anatomy, motion, biases)
 
 
 def _seconds(t_ns: NDArray[np.int64]) -> Array:
@@ -176,6 +192,13 @@ def _check_scenario(organ: str, vibration: str, level: int, seed: int, driving: 
     if seed < 0:
         raise SimulationError(f"simulate: seed is {seed}; give a whole number ≥ 0")
     return level, seed
+
+
+def _check_place(start: float | None, wall_motion: float) -> None:
+    if start is not None and not 0 <= start <= 1:
+        raise SimulationError(f"simulate: start is {start}; give a share of the organ from 0 (entrance) to 1 (exit)")
+    if not 0 <= wall_motion <= 3:
+        raise SimulationError(f"simulate: wall_motion is {wall_motion}; give a scale from 0 (still) to 3")
 
 
 def _whole(what: str, value: Any, span: str) -> int:

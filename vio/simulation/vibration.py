@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import make_interp_spline
 
+from vio.simulation.contact import Contacts
 from vio.simulation.path import MARGIN_S
 
 Array = NDArray[np.float64]
@@ -26,6 +27,7 @@ MAX_LEVEL = 5
 
 GAUSSIAN_STEP_M = 1e-4
 GAUSSIAN_KNOT_HZ = 8.0
+_RESIDUE_HZ = 0.8
 _COLLISION_WINDOW_S = 0.5  # after it an impulse is below 1e-13 of its peak
 
 
@@ -101,28 +103,37 @@ class PeristalticVibration:
 
 
 class CollisionVibration:
-    """Impulses at random times, up to 1.6 per second: a decaying oscillation of 5 to 45 Hz, C2 at its onset.
+    """Impulses from residue and from contacts with the wall: a decaying oscillation of 5 to 45 Hz, C2 at its onset.
 
-    Each pushes up to 0.30 mm and turns up to 1.6 degrees at level 5, less at high frequency. An event has
-    a mark in [0, 1); a level keeps those below its share of the rate, and always the lowest, so that even
-    the shortest recording is hit at least once.
+    Residue hits at random, up to 0.8 times per second, from any side. A contact hits when and where the capsule's
+    nominal motion meets the wall, the harder the faster. Each pushes up to 0.30 mm and turns up to 1.6 degrees at
+    level 5, less at high frequency. An event has a mark in [0, 1); a level keeps those below its share, and always the
+    lowest, so that even the shortest recording is hit at least once.
     """
 
-    def __init__(self, level: int, duration_s: float, rng: np.random.Generator) -> None:
-        strength, highest_rate = level / MAX_LEVEL, 0.4 + 1.2
+    def __init__(self, level: int, duration_s: float, rng: np.random.Generator,
+                 contacts: Contacts | None = None) -> None:
+        strength = level / MAX_LEVEL
         latest_s = duration_s - min(0.1, 0.5 * duration_s)  # so that no event falls after the last frame
-        count = max(int(rng.poisson(highest_rate * latest_s)), 1)
-        start = np.sort(rng.uniform(0.0, latest_s, count))
-        hz = np.exp(rng.uniform(np.log(5), np.log(45), count))
-        rise_s = rng.uniform(0.012, 0.035, count)
-        size, mark, phase = rng.uniform(0.4, 1.0, count), rng.random(count), rng.uniform(0, 2 * np.pi, count)
+        count = max(int(rng.poisson(_RESIDUE_HZ * latest_s)), 1)
+        start = rng.uniform(0.0, latest_s, count)
+        size = rng.uniform(0.4, 1.0, count)
         axis, push = (_unit_rows(rng.standard_normal((count, 3))) for _ in range(2))
-        share = (0.4 + 1.2 * strength) / highest_rate
-        keep = (mark <= max(share, float(mark.min()))) & (level > 0)
+        if contacts is not None:
+            early = contacts.t_s < latest_s
+            start, size = np.append(start, contacts.t_s[early]), np.append(size, contacts.strength[early])
+            axis, push = np.vstack([axis, contacts.turn[early]]), np.vstack([push, contacts.push[early]])
+            count = len(start)
+        hz = np.exp(rng.uniform(np.log(5), np.log(45), count))
+        rise_s, phase = rng.uniform(0.012, 0.035, count), rng.uniform(0, 2 * np.pi, count)
+        mark = rng.random(count)
+        keep = (mark <= max(0.25 + 0.75 * strength, float(mark.min()))) & (level > 0)
         size = size * strength * np.minimum(20.0 / hz, 2.0)
-        self._direction = (size[:, None] * np.hstack([np.deg2rad(1.6) * axis, 0.30e-3 * push]))[keep]
-        self._rise, self._omega, self._phase = rise_s[keep], 2 * np.pi * hz[keep], phase[keep]
-        self.kinks_s = start[keep]
+        direction = size[:, None] * np.hstack([np.deg2rad(1.6) * axis, 0.30e-3 * push])
+        order = np.flatnonzero(keep)[np.argsort(start[keep], kind="stable")]
+        self._direction, self._rise = direction[order], rise_s[order]
+        self._omega, self._phase = 2 * np.pi * hz[order], phase[order]
+        self.kinks_s = start[order]
 
     def __call__(self, t_s: Array) -> tuple[Array, Array, Array]:
         """See `Vibration`. Each time looks only at the events of the last half second."""
@@ -157,8 +168,8 @@ class CollisionVibration:
         return envelope * sine, first, second
 
 
-def make_vibration(kind: str, level: int, duration_s: float, seed: int) -> Vibration:
-    """The vibration of one recording; level 0 and kind "none" are still."""
+def make_vibration(kind: str, level: int, duration_s: float, seed: int, contacts: Contacts | None = None) -> Vibration:
+    """The vibration of one recording; level 0 and kind "none" are still. Only collisions listen to contacts."""
     if level == 0 or kind == "none":
         return NoVibration()
     rng = np.random.default_rng([seed, 2, KINDS.index(kind)])
@@ -166,7 +177,7 @@ def make_vibration(kind: str, level: int, duration_s: float, seed: int) -> Vibra
         return GaussianVibration(level, duration_s, rng)
     if kind == "peristalsis":
         return PeristalticVibration(level, rng)
-    return CollisionVibration(level, duration_s, rng)
+    return CollisionVibration(level, duration_s, rng, contacts)
 
 
 def _unit_rows(v: Array) -> Array:

@@ -1,0 +1,1 @@
+"""What training without labels minimises: small terms, and the methods' own combinations of them."""

@@ -1,0 +1,82 @@
+"""From a network's raw numbers to depth and motion."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from learned.networks.rigid_motion import inverse_rigid, rigid, rotation_from_euler_xyz, rotation_from_vector
+from vio.errors import ConfigError
+
+ROTATIONS = {"euler_xyz": rotation_from_euler_xyz, "vector": rotation_from_vector}
+ORDERS = ("rotation_first", "translation_first")
+PAIR_ORDERS = ("i_then_j", "j_then_i", "temporal")
+
+
+@dataclass(frozen=True)
+class DepthRange:
+    """Depth from a disparity s in 0..1: depth = 1 / (1/farthest + (1/nearest - 1/farthest) s), in motion units.
+
+    Raises:
+        ConfigError: not 0 < nearest < farthest.
+    """
+
+    nearest: float
+    farthest: float
+
+    def __post_init__(self) -> None:
+        if not 0 < self.nearest < self.farthest:
+            raise ConfigError(f"depth range {self.nearest:g} to {self.farthest:g}: need 0 < nearest < farthest")
+
+    def depth(self, disparity: Tensor) -> Tensor:
+        """Any shape, 0..1 → z-depth in motion units."""
+        far, near = 1 / self.farthest, 1 / self.nearest
+        return 1 / (far + (near - far) * disparity)
+
+    def disparity(self, depth: float) -> float:
+        """The disparity of a depth within the range."""
+        far, near = 1 / self.farthest, 1 / self.nearest
+        return (1 / depth - far) / (near - far)
+
+
+@dataclass(frozen=True)
+class PoseParametrisation:
+    """How six raw numbers of an ordered pair of images are read as T_i_j, the pose of camera j in camera i.
+
+    Raises:
+        ConfigError: an unknown name, or a scale that is not positive.
+    """
+
+    rotation: str = "vector"
+    """"vector": rotation vector; "euler_xyz": R = Rx Ry Rz."""
+    order: str = "rotation_first"
+    """Which three numbers come first."""
+    scale: float = 0.01
+    """All six are multiplied by it, so that an untrained network predicts small motions."""
+    pair_order: str = "i_then_j"
+    """Which image the network sees first when T_i_j is wanted. Its motion maps points of the second camera to the first
+    with "i_then_j", and of the first to the second with "j_then_i". "temporal" shows the earlier frame first, maps its
+    points to the later camera, and inverts where the other direction is wanted."""
+
+    def __post_init__(self) -> None:
+        for value, known in ((self.rotation, ROTATIONS), (self.order, ORDERS), (self.pair_order, PAIR_ORDERS)):
+            if value not in known:
+                raise ConfigError(f"pose parametrisation {value!r}: unknown, choose one of {', '.join(known)}")
+        if not self.scale > 0:
+            raise ConfigError(f"pose scale {self.scale:g}: must be positive")
+
+    def images(self, i: int, j: int) -> tuple[int, int]:
+        """Numbers of the frames that the network sees first and second for T_i_j."""
+        if self.pair_order == "temporal":
+            return min(i, j), max(i, j)
+        return (i, j) if self.pair_order == "i_then_j" else (j, i)
+
+    def motion(self, raw: Tensor, i: int, j: int) -> Tensor:
+        """Raw numbers (N, 6) of the images in that order → T_i_j (N, 4, 4) in motion units."""
+        numbers = self.scale * (raw.float() if raw.dtype in (torch.float16, torch.bfloat16) else raw)
+        first, second = numbers[:, :3], numbers[:, 3:]
+        turn, shift = (first, second) if self.order == "rotation_first" else (second, first)
+        T = rigid(ROTATIONS[self.rotation](turn), shift)
+        return inverse_rigid(T) if self.pair_order == "temporal" and i < j else T

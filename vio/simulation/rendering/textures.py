@@ -1,0 +1,163 @@
+"""Fine texture of the mucosa on the unrolled wall: vessels, relief, the wet film with its bubbles.
+
+A texel holds eight numbers: optical density R, G, B; slopes of the tissue's relief along and around; slopes of the wet
+film along and around; foam. Textures are made in sections from the seed, each with its mip levels (halved by
+averaging), so that far walls neither flicker nor alias. Everything coarser than a few millimetres lives on the wall's
+own grid (`vio.simulation.wall`).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from vio.simulation.anatomy import Anatomy
+from vio.simulation.noise_fields import BandNoise, Field, Recent
+from vio.simulation.rendering.vessels import Branch, grow, paint
+from vio.simulation.wall import ROW_M, TAU
+
+TEXEL_M = ROW_M / 4
+LEVELS = 4
+CHANNELS = 8
+_SECTION = 1024  # texels along; a multiple of 2**LEVELS
+_SECTIONS_KEPT = 2  # beside the window: a capsule that goes to and fro needs its neighbours again
+_HALO = 64
+_BLOOD = np.array([0.30, 1.0, 0.75], np.float32)
+_TISSUE = np.array([0.25, 0.8, 1.0], np.float32)
+_FILM_MM = 0.09
+
+
+@dataclass(frozen=True)
+class TextureWindow:
+    """Textures of a stretch of wall: one array (rows, columns, 8) float32 per level."""
+
+    first_m: float
+    """Where along the wall texel row 0 begins."""
+    levels: tuple[Field, ...]
+
+
+class Textures:
+    """Textures of one anatomy, made where they are looked at.
+
+    Args:
+        anatomy: whose wall.
+    """
+
+    def __init__(self, anatomy: Anatomy) -> None:
+        organ, seed = anatomy.organ, anatomy.seed
+        self._organ, self._seed = organ, seed
+        step = 2**LEVELS
+        self.columns = round(TAU * organ.radius_m / TEXEL_M / step) * step
+        fine = (TEXEL_M, TAU * organ.radius_m / self.columns)
+        coarse = (4 * fine[0], 4 * fine[1])
+        self._mid = BandNoise((*seed, 21), self.columns // 4, coarse, 2.5e-3, 14e-3, 1.0)
+        self._film = BandNoise((*seed, 22), self.columns // 4, coarse, 1.5e-3, 9e-3)
+        self._fine = BandNoise((*seed, 23), self.columns, fine, 0.35e-3, 1.6e-3, blocks_kept=2)
+        grain = {"circular": (0.45e-3, 1.1e-3), "haustral": (0.9e-3, 2.2e-3), "rugae": (1.5e-3, 4e-3)}[organ.folds]
+        self._grain = BandNoise((*seed, 24), self.columns, fine, *grain, blocks_kept=2)
+        self._sections = Recent(lambda k: _mip_levels(self._make(k)), _SECTIONS_KEPT)
+        self._window: tuple[range, TextureWindow] | None = None
+
+    def window(self, low_m: float, high_m: float) -> TextureWindow:
+        """Textures between two places along the wall [m]; kept until another stretch is asked for."""
+        wanted = range(int(np.floor(low_m / TEXEL_M / _SECTION)), int(np.floor(high_m / TEXEL_M / _SECTION)) + 1)
+        if self._window is None or not (self._window[0].start <= wanted.start and wanted.stop <= self._window[0].stop):
+            self._window = None  # frees the old one first
+            parts = [self._sections.get(k) for k in wanted]
+            levels = tuple(np.concatenate([part[level] for part in parts]) for level in range(LEVELS))
+            self._window = (wanted, TextureWindow(wanted.start * _SECTION * TEXEL_M, levels))
+        return self._window[1]
+
+    def _make(self, k: int) -> Field:
+        """Texels (_SECTION, columns, 8) of section k."""
+        first, rows = k * _SECTION - _HALO, _SECTION + 2 * _HALO
+        look = self._organ.look
+        mid, film = (self._coarse(noise, first, rows) for noise in (self._mid, self._film))
+        fine, grain = self._fine.rows(first, first + rows), self._grain.rows(first, first + rows)
+        surface, deep = self._vessels(k, first, rows)
+        tissue, blood = 0.13 * mid + 0.045 * fine, look.vessel_density * (surface + deep)
+        if look.villi:
+            tissue += 0.16 * np.tanh(-grain)
+            relief_mm = look.relief_mm[0] * np.tanh(1.5 * grain) + look.relief_mm[1] * mid
+        else:
+            share = 0.02 if self._organ.folds == "haustral" else 0.05
+            relief_mm = look.relief_mm[0] * fine + look.relief_mm[1] * mid + share * grain
+        film_mm, foam = self._bubbles(k, first, _FILM_MM * film)
+        texels = np.empty((rows, self.columns, CHANNELS), np.float32)
+        texels[..., :3] = tissue[..., None] * _TISSUE + blood[..., None] * _BLOOD
+        texels[..., 3], texels[..., 4] = _slopes(relief_mm)
+        texels[..., 5], texels[..., 6] = _slopes(film_mm)
+        texels[..., 7] = foam
+        return texels[_HALO:-_HALO]
+
+    def _coarse(self, noise: BandNoise, first: int, rows: int) -> Field:
+        """A field of a quarter of the resolution, interpolated."""
+        values = noise.rows(first // 4 - 2, (first + rows) // 4 + 2)
+        wrapped = np.concatenate([values[:, -2:], values, values[:, :2]], axis=1)
+        large = cv2.resize(wrapped, (4 * wrapped.shape[1], 4 * wrapped.shape[0]), interpolation=cv2.INTER_LINEAR)
+        out: Field = large[8: 8 + rows, 8: 8 + self.columns]
+        return out
+
+    def _vessels(self, k: int, first: int, rows: int) -> tuple[Field, Field]:
+        """Sharp vessels at the surface and blurred ones below it; trees of the neighbouring sections reach in."""
+        area_m2 = _SECTION * TEXEL_M * TAU * self._organ.radius_m
+        trees: list[list[Branch]] = [[], []]
+        for layer, per_m2 in enumerate((self._organ.look.vessels_per_m2, 0.0 if self._organ.look.villi else 1400.0)):
+            for section in (k - 1, k, k + 1):
+                rng = np.random.default_rng([*self._seed, 25 + layer, section + 1_000_000])
+                for points, width in grow(rng, int(rng.poisson(per_m2 * area_m2)), _SECTION, self.columns, TEXEL_M):
+                    trees[layer].append((points + np.array([0.0, section * _SECTION]), width))
+        surface, deep = (paint(branches, first, rows, self.columns) for branches in trees)
+        if self._organ.look.villi:
+            surface = cv2.GaussianBlur(surface, (0, 0), 1.5)
+        return surface, 0.8 * cv2.GaussianBlur(deep, (0, 0), 5)
+
+    def _bubbles(self, k: int, first: int, film_mm: Field) -> tuple[Field, Field]:
+        """The film with patches of bubbles on it, and where they are."""
+        film_mm, foam = film_mm.copy(), np.zeros_like(film_mm)
+        around_texel_m = TAU * self._organ.radius_m / self.columns
+        for section in (k - 1, k, k + 1):
+            rng = np.random.default_rng([*self._seed, 27, section + 1_000_000])
+            for _ in range(int(rng.poisson(self._organ.look.foam * _SECTION * TEXEL_M))):
+                middle = rng.uniform(0, [_SECTION * TEXEL_M, TAU * self._organ.radius_m])
+                count, spread = int(rng.integers(8, 60)), rng.uniform(1.5e-3, 5e-3)
+                places = middle + spread * rng.standard_normal((count, 2))
+                for place, radius in zip(places, 1e-3 * rng.uniform(0.25, 1.1, count) ** 1.5, strict=True):
+                    texel = (place[0] / TEXEL_M + section * _SECTION - first, place[1] / around_texel_m)
+                    _stamp_bubble(film_mm, foam, texel, radius / TEXEL_M)
+        return film_mm, foam
+
+
+def _stamp_bubble(film_mm: Field, foam: Field, texel: tuple[float, float], radius_texels: float) -> None:
+    """Raise the film to a dome, in place; wraps around the lumen."""
+    low, high = int(np.floor(texel[0] - radius_texels)), int(np.ceil(texel[0] + radius_texels)) + 1
+    if low < 0 or high > len(film_mm):
+        low, high = max(low, 0), min(high, len(film_mm))
+        if low >= high:
+            return
+    columns = np.arange(int(np.floor(texel[1] - radius_texels)), int(np.ceil(texel[1] + radius_texels)) + 1)
+    along, around = np.arange(low, high)[:, None] - texel[0], columns[None] - texel[1]
+    inside = 1 - (along**2 + around**2) / radius_texels**2
+    dome = 0.7e3 * TEXEL_M * radius_texels * np.sqrt(np.clip(inside, 0, None)).astype(np.float32)
+    place = (slice(low, high), columns % film_mm.shape[1])
+    film_mm[place] = np.maximum(film_mm[place], np.where(inside > 0, dome + 0.1, film_mm[place]))
+    foam[place] = np.maximum(foam[place], np.where(inside > 0, np.float32(1.0), np.float32(0.0)))
+
+
+def _slopes(height_mm: Field) -> tuple[Field, Field]:
+    """Slopes along and around of a height; the columns close on themselves."""
+    along = np.gradient(height_mm, np.float32(1e3 * TEXEL_M), axis=0)
+    around = (np.roll(height_mm, -1, 1) - np.roll(height_mm, 1, 1)) / np.float32(2e3 * TEXEL_M)
+    return along, around
+
+
+def _mip_levels(texels: NDArray[np.float32]) -> tuple[Field, ...]:
+    """The texels and their averages over 2x2, 4x4 and 8x8."""
+    levels = [np.ascontiguousarray(texels)]
+    for _ in range(LEVELS - 1):
+        t = levels[-1]
+        levels.append(np.ascontiguousarray(0.25 * (t[::2, ::2] + t[1::2, ::2] + t[::2, 1::2] + t[1::2, 1::2])))
+    return tuple(levels)
