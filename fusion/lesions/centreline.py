@@ -20,23 +20,32 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import solveh_banded
+from scipy.ndimage import gaussian_filter1d
 from scipy.sparse import csr_array
 
 Array = NDArray[np.float64]
 
 NODE_M = 4e-3
 """Spacing of the chain's nodes."""
+STEP_M = 0.5e-3
+"""A capsule that moved less since it was last looked at is where it was."""
 GRID_M = 2e-3
 """Spacing of the smooth line's points."""
-SMOOTHING_M = 6e-3
-"""Waves across the line are halved at wavelengths of 2 pi times this, and soon vanish below."""
+SMOOTHING_M, SMOOTHING_PER_SWAY = 4e-3, 1.1
+"""Waves across the line are halved at wavelengths of 2 pi times the smoothing length, and soon vanish below. That
+length is the first number and the second times how far (rms) the capsule sways from the line: a wide gut leaves more
+room, and bends less tightly."""
+FIRST_SWAY_M = 3.5e-3
+"""Assumed until a first line is there to measure it from."""
 REACH_M = 30e-3
 """How far along the line a frame is looked for from where the frame before was, beyond the distance it moved."""
-ASIDE_M = 12e-3
+ZIGZAG_M, ZIGZAG_GRID_M = 15e-3, 1e-3
+"""Standard deviation of the average along the track that the chain is laid through, and its grid."""
+ASIDE_M = 15e-3
 """Further than this from the line a position does not shape it: the track has drifted between two visits."""
 DRIFTED, FOLLOW = 0.5, 0.2
 """From this share of it on, drift is followed by this much per frame, so that a drifting track is not lost."""
-ROUNDS = 3
+ROUNDS = 4
 
 
 @dataclass(frozen=True)
@@ -55,29 +64,34 @@ class Centreline:
     """(M,) which frames shape the line."""
     drift_m: Array
     """(M, 3) how far the track is off the line it laid down before; zero unless it drifts by centimetres."""
+    smoothing_m: float
+    """Smoothing length of the last fit."""
+    sway_m: float
+    """How far the capsule sways from the line, root mean square."""
 
     def smooth(self, positions_m: Array) -> Array:
         """The lines (S, J, 3) of other positions (S, M, 3) of the same frames, in the places they have here."""
         sampled = np.asarray(positions_m, float) - self.drift_m
         count, frames = sampled.shape[:2]
         columns = np.moveaxis(sampled, 1, 0).reshape(frames, -1)
-        points = _fit(columns, self.frame_place, self.frame_counts, len(self.points_m))
+        points = _fit(columns, self.frame_place, self.frame_counts, len(self.points_m), self.smoothing_m)
         return np.moveaxis(points.reshape(-1, count, 3), 0, 1)
 
 
 def trace_centreline(positions_m: Array) -> Centreline:
     """The centreline through positions (M, 3) of a track, in the order they were travelled."""
     p = np.asarray(positions_m, float)
-    s, off, drift = _walk(p)
-    p = p - drift
+    s, off, drift = _walk(_without_zigzag(p))
+    p, sway = p - drift, FIRST_SWAY_M
     for _ in range(ROUNDS):
-        place, counts = (s - s.min()) / GRID_M, off <= ASIDE_M
-        points = _fit(p, place, counts, int(np.ceil(place.max())) + 2)
+        place, counts, smoothing = (s - s.min()) / GRID_M, off <= ASIDE_M, SMOOTHING_M + SMOOTHING_PER_SWAY * sway
+        points = _fit(p, place, counts, int(np.ceil(place.max())) + 2, smoothing)
         arc = arc_length(points)
         s, off = _project_frames(p, points, arc, place)
+        sway = float(np.sqrt(np.mean(np.minimum(off, ASIDE_M) ** 2)))
     if np.cov(s, np.arange(len(s)))[0, 1] < 0:  # the chain took the capsule's first retreat for the way ahead
         points, arc, s, place = points[::-1], arc[-1] - arc[::-1], arc[-1] - s, len(points) - 1 - place
-    return Centreline(points, arc - s[0], s - s[0], place, counts, drift)
+    return Centreline(points, arc - s[0], s - s[0], place, counts, drift, smoothing, sway)
 
 
 def arc_length(points_m: Array) -> Array:
@@ -127,18 +141,32 @@ class _Chain:
         self.low, self.high = min(self.low, number), max(self.high, number)
 
 
+def _without_zigzag(p: Array) -> Array:
+    """The track averaged along its own length: a capsule that sways from wall to wall leaves a zigzag."""
+    length = np.r_[0.0, np.cumsum(np.linalg.norm(np.diff(p, axis=0), axis=1))]
+    grid = np.arange(int(length[-1] / ZIGZAG_GRID_M) + 2) * ZIGZAG_GRID_M
+    even = np.column_stack([np.interp(grid, length, p[:, k]) for k in range(3)])
+    smooth = gaussian_filter1d(even, ZIGZAG_M / ZIGZAG_GRID_M, axis=0, mode="nearest")
+    return np.column_stack([np.interp(length, grid, smooth[:, k]) for k in range(3)])
+
+
 def _walk(p: Array) -> tuple[Array, Array, Array]:
     """Place (M,) [m] of every position along the chain, from the first node laid down; distance (M,) from it; drift."""
     chain = _Chain(p[0])
-    moved = np.r_[0.0, np.linalg.norm(np.diff(p, axis=0), axis=1)]
     place, off, drift = np.zeros(len(p)), np.zeros(len(p)), np.zeros((len(p), 3))
+    last = 0
     for k in range(1, len(p)):
-        reach = int(np.ceil((REACH_M + moved[k]) / NODE_M))
-        place[k], aside = _place_on_chain(chain, p[k] - drift[k - 1], place[k - 1], reach)
+        moved = float(np.linalg.norm(p[k] - p[last]))
+        if moved < STEP_M:
+            place[k], off[k], drift[k] = place[last], off[last], drift[last]
+            continue
+        reach = int(np.ceil((REACH_M + moved) / NODE_M))
+        place[k], aside = _place_on_chain(chain, p[k] - drift[last], place[last], reach)
         off[k] = float(np.linalg.norm(aside))
-        drift[k] = drift[k - 1]
+        drift[k] = drift[last]
         if off[k] > DRIFTED * ASIDE_M:  # the track has left the chain sideways, which a capsule cannot
             drift[k] += FOLLOW * (1 - DRIFTED * ASIDE_M / off[k]) * aside
+        last = k
     return place * NODE_M, off, drift
 
 
@@ -177,26 +205,26 @@ def _grow(chain: _Chain, point: Array, outward: Array, front: bool) -> float:
     return float(chain.low if front else chain.high)
 
 
-def _fit(columns: Array, place: Array, counts: NDArray[np.bool_], count: int) -> Array:
+def _fit(columns: Array, place: Array, counts: NDArray[np.bool_], count: int, smoothing_m: float) -> Array:
     """Smooth values (count, C) on the grid from those values (M, C) at places (M,) between grid points that count."""
     cell = np.clip(place.astype(np.int64), 0, count - 2)
     right = place - cell
     weight = counts / np.maximum(np.bincount(cell, counts, count)[cell], 1.0)
     frames = np.arange(len(place))
     hat = csr_array((np.r_[1 - right, right], (np.r_[frames, frames], np.r_[cell, cell + 1])), (len(place), count))
-    band = _roughness(count)
+    band = _roughness(count, smoothing_m)
     band[3] += np.bincount(cell, weight * (1 - right) ** 2, count) + np.bincount(cell + 1, weight * right**2, count)
     band[2, 1:] += np.bincount(cell, weight * right * (1 - right), count)[:-1]
     return np.asarray(solveh_banded(band, hat.T @ (weight[:, None] * columns)))
 
 
-def _roughness(count: int) -> Array:
+def _roughness(count: int, smoothing_m: float) -> Array:
     """Upper band (4, count) of the penalty on third differences, with a trace of one on first differences.
 
     The trace holds lines that have too few positions for a third difference to mean anything.
     """
     band = np.zeros((4, count))
-    for order, strength in ((3, (SMOOTHING_M / GRID_M) ** 6), (1, 1e-9)):
+    for order, strength in ((3, (smoothing_m / GRID_M) ** 6), (1, 1e-9)):
         kernel = np.array({3: [-1.0, 3.0, -3.0, 1.0], 1: [-1.0, 1.0]}[order])
         rows = count - order
         for a in range(order + 1):

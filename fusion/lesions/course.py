@@ -18,7 +18,7 @@ Array = NDArray[np.float64]
 
 ZERO = 0
 """Arc length counts from the first frame's place."""
-CHUNK = 10
+CHUNK, OWN_WAYS = 10, 12
 SAMPLE_REACH_M = 15e-3
 """How far a sampled point is looked for along its sampled line from where the estimate lies."""
 
@@ -77,6 +77,24 @@ class Course:
     def _lengths(self) -> tuple[Array, Array]:
         """Length along the estimate's line (1, J) and along the sampled ones (S, J)."""
         return arc_length(self.centreline.points_m[None]), arc_length(self.sampled_lines_m)
+
+    @cached_property
+    def ambiguity_m(self) -> Array:
+        """(T, M) by how much frames move along the line when some sampled trajectories find their own way.
+
+        Whether a capsule that comes back is where it was, or further on, can hang by little; the sampled lines take
+        over the estimate's answer, these do not.
+        """
+        joint, frames = self.joint, np.arange(len(self.t_s))
+        if joint is None:
+            return np.zeros((0, len(frames)))
+        p, R = self.refinement.trajectory.positions_m, self.refinement.trajectory.rotations
+        some = JointSamples(joint.node, joint.xi[:OWN_WAYS], joint.log_scale[:OWN_WAYS])
+        own = np.array([trace_centreline(track).frame_arc_m for track in p + some.position_errors(R, frames)])
+        places = self.frame_places(frames)
+        taken = np.array([_along(np.broadcast_to(length, (len(places), len(length))), places)
+                          for length in self._lengths[1][:OWN_WAYS]])
+        return np.asarray(own - (taken - taken[:, :1]))
 
     def frame_places(self, frames: NDArray[np.int64]) -> Array:
         """Where frames lie on the centreline, in grid steps."""

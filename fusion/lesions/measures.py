@@ -22,10 +22,11 @@ from fusion.lesions.merging import Place
 Array = NDArray[np.float64]
 
 LEVEL = 0.95
-WANDER_SHARE = 0.003
-"""Standard deviation of a length along the line, as a share of it: the capsule cuts corners and wobbles."""
-WANDER_M = 1.5e-3
-"""Standard deviation of every place along the line: the capsule trembles, and the smoothing has its end effects."""
+WANDER_SHARE = 0.01
+"""Standard deviation of a length along the line, as a share of it: the capsule cuts corners and sways."""
+WANDER_PER_SWAY = 1.0
+"""Standard deviation of every place along the line, over how far the capsule sways from it: where it leans on the wall
+of a bend, the place beside it is a matter of view."""
 SCALE_SHARE = 0.01
 """By how much estimated scales are off beyond what they claim (docs/results/accuracy.md): it stretches every length."""
 TILT_RAD = 0.12
@@ -54,6 +55,10 @@ class Along:
     """(S,) in every sampled trajectory."""
     own_m: float
     """Standard deviation that is this place's alone."""
+    zero_m: float
+    """Standard deviation of the first frame's place, from which arc length counts."""
+    ambiguous_m: Array
+    """(T,) by how much it moves when sampled trajectories find their own way."""
 
 
 @dataclass(frozen=True)
@@ -68,9 +73,8 @@ class Span:
 def along_line(course: Course, place: Place) -> tuple[Along | None, str]:
     """Where a place lies along the travelled centreline, or None and why it is unknown."""
     if not place.with_depth:
-        frames = np.array([fix.index for fix in place.fixes])
-        arc, sampled = course.arc_at(float(course.frame_places(frames).mean()))
-        return Along(arc, sampled, WANDER_M), ""
+        return capsule_along(course, *(fix.index for fix in place.fixes)), ""
+    wander = WANDER_PER_SWAY * course.centreline.sway_m
     frame = next(fix.index for fix in place.fixes if fix.with_depth)
     camera = course.refinement.trajectory.positions_m[frame]
     reach = float(np.linalg.norm(place.point_m - camera)) + VIEW_REACH_M
@@ -78,7 +82,15 @@ def along_line(course: Course, place: Place) -> tuple[Along | None, str]:
     beside = course.arc_of(place.point_m, errors, frame, reach)
     if beside is None:
         return None, "the lesion lies beyond the path that was travelled: its arc length is not known"
-    return Along(beside.arc_m, beside.sampled_m, float(np.hypot(WANDER_M, TILT_RAD * beside.aside_m))), ""
+    own = float(np.hypot(wander, TILT_RAD * beside.aside_m))
+    return Along(beside.arc_m, beside.sampled_m, own, wander, course.ambiguity_m[:, frame]), ""
+
+
+def capsule_along(course: Course, *frames: int) -> Along:
+    """Where the capsule itself was, in the mean over some frames."""
+    wander = WANDER_PER_SWAY * course.centreline.sway_m
+    arc, sampled = course.arc_at(float(course.frame_places(np.array(frames)).mean()))
+    return Along(arc, sampled, wander, wander, course.ambiguity_m[:, frames[(len(frames) - 1) // 2]])
 
 
 def _own_draws(place: Place, count: int) -> Array:
@@ -89,15 +101,15 @@ def _own_draws(place: Place, count: int) -> Array:
 
 def arc_interval(a: Along) -> Interval:
     """Arc length from the first frame [m]."""
-    own = np.array([WANDER_M, a.own_m, WANDER_SHARE * a.arc_m, SCALE_SHARE * a.arc_m])
-    return _interval(a.arc_m, a.sampled_m, own)
+    own = np.array([a.zero_m, a.own_m, WANDER_SHARE * a.arc_m, SCALE_SHARE * a.arc_m])
+    return _interval(a.arc_m, a.sampled_m, own, a.ambiguous_m)
 
 
 def distance_interval(a: Along, landmark: Along) -> Interval:
     """How far `a` lies beyond a landmark [m]; negative before it."""
     length = a.arc_m - landmark.arc_m
     own = np.array([a.own_m, landmark.own_m, WANDER_SHARE * length, SCALE_SHARE * length])
-    return _interval(length, a.sampled_m - landmark.sampled_m, own)
+    return _interval(length, a.sampled_m - landmark.sampled_m, own, a.ambiguous_m - landmark.ambiguous_m)
 
 
 def percent_interval(a: Along, start: Along, end: Along) -> Interval:
@@ -110,13 +122,14 @@ def percent_interval(a: Along, start: Along, end: Along) -> Interval:
         # A wobble of the line on either side is shared by the span: it moves the place like a Brownian bridge.
         bridge = WANDER_SHARE * abs(span) * np.sqrt(max(share * (1 - share), 0.0))
         own = np.array([a.own_m, (1 - share) * start.own_m, share * end.own_m, bridge]) * 100 / span
-    return _interval(100 * share, sampled, own)
+    moved = a.ambiguous_m - (1 - share) * start.ambiguous_m - share * end.ambiguous_m
+    return _interval(100 * share, sampled, own, moved * 100 / span)
 
 
-def _interval(value: float, sampled: Array, own: Array) -> Interval:
+def _interval(value: float, sampled: Array, own: Array, ambiguous: Array) -> Interval:
     if len(sampled) < 2:
         return Interval(value, None, None)
-    sd = float(np.sqrt(sampled.var(ddof=1) + (own**2).sum()))
+    sd = float(np.sqrt(sampled.var(ddof=1) + (own**2).sum() + (ambiguous**2).mean()))
     half = float(student.ppf(0.5 + 0.5 * LEVEL, len(sampled) - 1)) * sd
     return Interval(value, value - half, value + half)
 

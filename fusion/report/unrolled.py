@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusion.lesions.course import Course
+from fusion.lesions.measures import arc_interval, capsule_along
 from fusion.report import figures
 from fusion.report.figures import Figure
 from fusion.report.words import NBSP
@@ -22,7 +23,6 @@ Array = NDArray[np.float64]
 Row = Mapping[str, Any]
 
 BAND_FRAMES = 400
-Z_95 = 1.96
 KINDS = (("finding", "lesions", "circle", "--lesion"), ("landmark", "landmarks", "diamond", "--landmark"))
 
 
@@ -54,12 +54,11 @@ def _band(course: Course, factor: float) -> list[Figure]:
     if course.joint is None:
         return []
     frames = np.unique(np.linspace(0, len(course.t_s) - 1, BAND_FRAMES).round().astype(np.int64))
-    sampled = [course.arc_at(float(place)) for place in course.frame_places(frames)]
-    middle = np.array([arc for arc, _ in sampled]) * factor
-    half = Z_95 * np.array([draws.std(ddof=1) for _, draws in sampled]) * factor
+    spread = [arc_interval(capsule_along(course, int(frame))) for frame in frames]
+    _, low, high = (factor * np.array(part, float) for part in zip(*spread, strict=True))
     t = course.t_s[frames]
     return [{"x": figures.numbers(np.concatenate([t, t[::-1]])), "type": "scatter", "mode": "lines",
-             "y": figures.numbers(np.concatenate([middle + half, (middle - half)[::-1]])), "fill": "toself",
+             "y": figures.numbers(np.concatenate([high, low[::-1]])), "fill": "toself",
              "fillcolor": "--refined-band", "name": "95 % of the capsule", "line": {"width": 0}, "hoverinfo": "skip"}]
 
 

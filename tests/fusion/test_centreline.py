@@ -91,5 +91,5 @@ def test_simulated_courses_are_measured_along_the_lumen(organ: str, driving: str
     lumen, truth = true_lumen(simulation), simulation.recording.truth
     arc = lumen.frame_arc_m - lumen.frame_arc_m[0]
     found = trace_centreline(truth.positions_m).frame_arc_m
-    assert np.abs(found - arc).max() < 4e-3 + 0.01 * np.ptp(arc)
-    assert truth.path_length_m > 1.15 * np.ptp(arc)
+    assert np.abs(found - arc).max() < 10e-3 + 0.03 * np.ptp(arc)  # it sways by millimetres from wall to wall
+    assert truth.path_length_m > 1.5 * np.ptp(arc)
