@@ -1,4 +1,5 @@
-"""The command line: `capsule-vio demo | doctor | simulate | inspect | predict | refine | compare | locate | report`.
+"""The command line: `capsule-vio demo | doctor | simulate | convert | inspect | predict | refine | compare |
+locate | report`.
 
 Exit codes: 0 done; 2 wrong usage; 3 the input cannot be used; 4 no estimator produced a trajectory;
 1 a bug (traceback). Heavy libraries load only in the command that needs them.
@@ -23,8 +24,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Run one command and return its exit code."""
     arguments = build_parser().parse_args(argv)
     commands: dict[str, Callable[[argparse.Namespace], int]] = {
-        "demo": _demo, "doctor": _doctor, "simulate": _simulate, "inspect": _inspect, "predict": _predict,
-        "refine": _refine, "compare": _compare, "locate": _locate, "report": _report,
+        "demo": _demo, "doctor": _doctor, "simulate": _simulate, "convert": _convert, "inspect": _inspect,
+        "predict": _predict, "refine": _refine, "compare": _compare, "locate": _locate,
+        "report": _report,
     }
     try:
         return commands[arguments.command](arguments)
@@ -129,6 +131,35 @@ def _simulate_dataset(arguments: argparse.Namespace) -> int:
     return 0
 
 
+def _convert(arguments: argparse.Namespace) -> int:
+    from vio.conversion import convert_to_asl
+    from vio.formats import open_recording
+    from vio.formats.declared import Declared
+    from vio.formats.kalibr import read_calibration, write_kalibr
+    from vio.inspection import describe
+
+    if arguments.imu_calibration is not None and arguments.calibration is None:
+        raise UsageError("--imu-calibration needs --calibration, which says where the camera sits on that IMU")
+    calibration = None
+    if arguments.calibration is not None:
+        calibration = read_calibration(arguments.calibration, arguments.imu_calibration)
+    planes = None if arguments.depth_planes is None else tuple(arguments.depth_planes)
+    declared = Declared(calibration, arguments.rate_hz, arguments.unit_m, planes, arguments.presentation_times)
+    if arguments.to == "kalibr":
+        recording = open_recording(arguments.source, arguments.format, declared)
+        write_kalibr(recording.calibration, arguments.out)
+    else:
+        with _Progress() as progress:
+            recording = convert_to_asl(arguments.source, arguments.out, arguments.format, declared, progress.count)
+    found = describe(recording)
+    if arguments.json:
+        _print_json(found)
+    else:
+        print(f"{arguments.out}: written as {arguments.to}")
+        print("\n".join(f"{name.ljust(8)} {text}" for name, text in found.items()))
+    return 0
+
+
 def _inspect(arguments: argparse.Namespace) -> int:
     from vio.formats import open_recording
     from vio.inspection import format_inspection, inspect_recording
@@ -183,6 +214,7 @@ def _refine(arguments: argparse.Namespace) -> int:
         import learned
 
         motions = learned.predict(recording, arguments.weights)
+    inputs = {name: path for name, path in inputs.items() if path.is_file()}
     with _Progress() as progress:
         refined = refine(recording, motions, config, progress)
     command = ["refine", arguments.recording.name, "--out", arguments.out.name]

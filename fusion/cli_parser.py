@@ -8,6 +8,8 @@ from pathlib import Path
 from typing import TypeAlias
 
 ORGANS = ("colon", "small-bowel", "stomach")
+FORMATS = ("asl", "endoslam", "vrcaps", "simcol3d", "scared", "tum-rgbd", "jhu-sinus", "kitti", "c3vd", "video",
+           "images")
 VIBRATIONS = ("none", "gaussian", "peristalsis", "collision")
 DRIVING = ("natural", "operated", "brisk", "transit")
 CAMERAS = ("mirocam", "fisheye-140", "fisheye-156", "pinhole-110")
@@ -23,7 +25,8 @@ def build_parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("--version", action="version", version=f"%(prog)s {_version()}")
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
-    for add in (_demo, _doctor, _simulate, _inspect, _predict, _refine, _compare, _locate, _report):
+    for add in (_demo, _doctor, _simulate, _convert, _inspect, _predict, _refine, _compare, _locate,
+                _report):
         add(commands)
     return parser
 
@@ -79,6 +82,27 @@ def _simulate(commands: Commands) -> None:
                                                             "kinds of vibration; goes on where it was stopped")
     parser.add_argument("--workers", type=int, default=1, metavar="N", help="processes that render a data set")
     parser.add_argument("--out", type=Path, required=True, metavar="DIR")
+
+
+def _convert(commands: Commands) -> None:
+    parser = _command(commands, "convert", "write a recording of another format as an ASL folder (docs/formats.md)",
+                      "convert Frames_S1 --to asl REC --rate-hz 30 --calibration camchain.yaml")
+    parser.add_argument("source", type=Path, metavar="SRC", help="folder or film; it is only read")
+    parser.add_argument("--to", choices=("asl", "kalibr"), required=True,
+                        help="the whole recording, or only its calibration in Kalibr's files")
+    parser.add_argument("out", type=Path, metavar="OUT")
+    parser.add_argument("--format", choices=FORMATS, metavar="NAME",
+                        help=f"default: recognised by what lies in SRC; one of {', '.join(FORMATS)}")
+    known = parser.add_argument_group("what the files do not say and you know")
+    known.add_argument("--calibration", type=Path, metavar="YAML", help="Kalibr camchain.yaml or ASL cam0/sensor.yaml")
+    known.add_argument("--imu-calibration", type=Path, metavar="YAML", help="Kalibr imu.yaml or ASL imu0/sensor.yaml")
+    known.add_argument("--rate-hz", type=float, metavar="HZ", help="constant frame rate of data without times")
+    known.add_argument("--unit-m", type=float, metavar="M", help="metres per unit of rendered or reconstructed data")
+    known.add_argument("--depth-planes", type=float, nargs=2, metavar=("NEAR", "FAR"),
+                       help="clip planes of the renderer, in that unit")
+    known.add_argument("--presentation-times", action="store_true", default=None,
+                       help="the film's presentation times ARE the capture times")
+    _json(parser)
 
 
 def _inspect(commands: Commands) -> None:

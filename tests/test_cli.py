@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from fusion.cli import main
+from vio.formats import open_recording
 from vio.motions import load_motions
 
 FRAMES, SECONDS = 60, 20
@@ -103,8 +104,9 @@ def test_a_truth_can_be_given_and_losing_is_said(made, tmp_path, capsys):
     assert "LOSES" in capsys.readouterr().out
 
 
-@pytest.mark.parametrize("arguments", [[], ["refine"], ["refine", "REC"], ["no-such"], ["simulate", "--out", "x"],
-                                       ["simulate", "--organ", "liver", "--out", "x"]])
+@pytest.mark.parametrize("arguments", [[], ["refine"], ["refine", "REC"], ["no-such"], ["simulate"],
+                                       ["simulate", "--organ", "liver", "--out", "x"],
+                                       ["simulate", "--dataset", "mm-wce", "--no-images", "--out", "x"]])
 def test_wrong_usage_exits_2(arguments, capsys):
     try:
         code = main(arguments)
@@ -248,9 +250,29 @@ def test_prediction_without_weights_says_so(made, tmp_path, capsys):
     assert not (tmp_path / "m.npz").exists()
 
 
-def test_rendered_images_are_refused_until_they_exist(tmp_path, capsys):
-    assert main(["simulate", "--out", str(tmp_path / "REC")]) == 2
-    assert "--no-images" in one_line(capsys)
+def test_images_are_simulated_and_inspected(tmp_path, capsys):
+    pytest.importorskip("numba", reason="images need the extra 'sim'")
+    scenario = ["--organ", "small-bowel", "--vibration", "collision", "--level", "3", "--duration", "2", "--seed", "3"]
+    arguments = ["simulate", *scenario, "--camera", "fisheye-140", "--size", "64", "--products", "mask", "flow"]
+    assert main([*arguments, "--out", str(tmp_path / "REC")]) == 0
+    assert main(["inspect", str(tmp_path / "REC"), "--json"]) == 0
+    out = capsys.readouterr().out
+    found = json.loads(out[out.index("{"):])
+    assert found["usable"] and {"name": "images", "level": "ok", "text": "all 6 image files exist"} in found["checks"]
+    assert main([*arguments[:-3], "--no-images", "--out", str(tmp_path / "PLAIN")]) == 0
+    plain, rendered = (open_recording(tmp_path / name) for name in ("PLAIN", "REC"))
+    np.testing.assert_array_equal(plain.truth.T_world_body, rendered.truth.T_world_body)  # one motion drives both
+    np.testing.assert_array_equal(plain.imu.accel_m_s2, rendered.imu.accel_m_s2)
+
+
+@pytest.mark.parametrize(("change", "word"), [
+    (["--level", "7"], "from 0 to 5"), (["--duration", "0"], "above 0"), (["--seed", "-1"], "≥ 0"),
+    (["--size", "5"], "give 16 to 4096"), (["--size", "0"], "whole number of pixels"), (["--start", "2"], "from 0"),
+])
+def test_what_cannot_be_simulated_exits_3_and_writes_nothing(tmp_path, capsys, change, word):
+    assert main(["simulate", "--out", str(tmp_path / "REC"), "--duration", "2", *change]) == 3
+    assert word in one_line(capsys)
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_compare_without_truth_says_what_to_give(made, tmp_path, capsys):

@@ -2,10 +2,12 @@
 
 from vio.calibration import Calibration as Calibration
 from vio.camera import Camera as Camera
+from vio.conversion import convert_to_asl as convert_to_asl
 from vio.errors import VioError as VioError
 from vio.formats import open_recording as open_recording
 from vio.formats.asl import read_asl as read_asl
 from vio.formats.asl import write_asl as write_asl
+from vio.formats.declared import Declared as Declared
 from vio.formats.kitti import read_kitti as read_kitti
 from vio.formats.kitti import write_kitti as write_kitti
 from vio.formats.tum import read_tum as read_tum

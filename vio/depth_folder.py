@@ -8,9 +8,11 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from vio.depth import DepthEncoding, LinearDepth
 from vio.errors import FormatError
 from vio.formats.asl import read_depth_listing
-from vio.recording import Recording, read_depth_image
+from vio.image_files import decode_image
+from vio.recording import Recording
 
 PREDICTION = "prediction.json"
 """Marks maps that a network predicted, one for every frame, metric at the prior scale."""
@@ -25,8 +27,8 @@ class DepthFolder:
     t_ns: NDArray[np.int64]
     """(N,) stamps."""
     files: tuple[Path, ...]
-    unit_m: float
-    """Metres per count."""
+    encoding: DepthEncoding
+    """What the pixels mean."""
     predicted: bool
     """Metric at the prior scale of the predictor, not measured."""
     start_ns: int
@@ -36,13 +38,14 @@ class DepthFolder:
         """z-depth (H, W) [m] of the frame at a time after the first frame, 0 where unknown; None when not mapped.
 
         Raises:
-            RecordingError: the map is absent, cut off, undecodable or not 16-bit.
+            RecordingError: the map is absent, cut off, undecodable, not of its declared kind, or of unknown scale.
         """
         off = np.abs((self.t_ns - self.start_ns) * NS - t_s)
         k = int(np.argmin(off))
         if off[k] > 1e-3:
             return None
-        return read_depth_image(self.files[k], f"{self.name}: depth at {t_s:.3f} s", self.unit_m)
+        what = f"{self.name}: depth at {t_s:.3f} s"
+        return self.encoding.depth_m(decode_image(self.files[k], what, depth=True), what)
 
 
 def read_depth_folder(folder: str | Path, recording: Recording | None = None) -> DepthFolder:
@@ -60,10 +63,10 @@ def read_depth_folder(folder: str | Path, recording: Recording | None = None) ->
     folder = Path(folder)
     if not (folder / "data.csv").is_file():
         raise FormatError(f"{folder.name}: no data.csv; give a folder of depth maps as `predict --depth` writes it")
-    t_ns, files, unit_m = read_depth_listing(folder)
+    t_ns, files, unit_m, encoding = read_depth_listing(folder)
     predicted = (folder / PREDICTION).is_file()
     if recording is None and not predicted:
         raise FormatError(f"{folder.name}: no {PREDICTION}, so the first map need not be the first frame's; name the "
                           "recording too")
     start_ns = int(t_ns[0]) if recording is None else int(recording.frame_t_ns[0])
-    return DepthFolder(folder.resolve().name, t_ns, files, unit_m, predicted, start_ns)
+    return DepthFolder(folder.resolve().name, t_ns, files, encoding or LinearDepth(unit_m), predicted, start_ns)

@@ -60,6 +60,11 @@ class ImuSamples:
     def __len__(self) -> int:
         return len(self.t_ns)
 
+    @classmethod
+    def none(cls) -> ImuSamples:
+        """No samples: what a recording without an IMU holds."""
+        return cls(np.zeros(0, np.int64), np.zeros((0, 3)), np.zeros((0, 3)))
+
 
 @dataclass(frozen=True)
 class Gap:

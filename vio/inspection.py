@@ -87,6 +87,8 @@ def _frames(recording: Recording) -> Check:
 
 
 def _images(recording: Recording) -> Check:
+    if recording.video is not None:
+        return Check("images", "ok", f"a film of {len(recording.video)} frames")
     listed = [path for path in recording.frame_paths if path is not None]
     there = sum(path.is_file() for path in listed)
     if there == len(recording):
@@ -123,6 +125,29 @@ def _truth(recording: Recording) -> Check:
         return Check("truth", "ok", "none: accuracy will not be reported")
     span = f"{recording.truth.t_s[0]:.1f} to {recording.truth.t_s[-1]:.1f} s"
     return Check("truth", "ok", f"{len(recording.truth)} poses from {span}, path {recording.truth.path_length_m:.3f} m")
+
+
+def describe(recording: Recording) -> dict[str, str]:
+    """What a recording holds and what it lacks, one sentence each, for whoever brought data of another format."""
+    camera, unknown = recording.calibration.camera, "unknown; declare it before anything geometric"
+    missing = 0 if recording.has_images else sum(path is None or not path.is_file() for path in recording.frame_paths)
+    images = f"{len(recording)} over {recording.duration_s:.3f} s"
+    return {
+        "format": str(recording.provenance.get("format", "asl")),
+        "frames": f"{images}, {missing} without an image file" if missing else images,
+        "camera": unknown if camera is None else f"{camera.model}, {camera.width} x {camera.height} pixels",
+        "depth": _depth_text(recording),
+        "truth": _truth(recording).text if recording.truth else str(recording.provenance.get("truth", "none")),
+        "imu": f"{len(recording.imu)} samples" if len(recording.imu) else "none: prediction works, refinement does not",
+    }
+
+
+def _depth_text(recording: Recording) -> str:
+    if not recording.has_depth_images:
+        return "none"
+    count = sum(path is not None for path in recording.depth_paths)
+    kind = "in metres" if recording.has_depth else "up to an unknown factor; declare --depth-planes and --unit-m"
+    return f"{count} images, {kind}"
 
 
 def format_inspection(inspection: Inspection) -> str:

@@ -9,16 +9,18 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from vio.calibration import Calibration, short_name
+from vio.calibration import Calibration
+from vio.depth import DepthEncoding, LinearDepth, RelativeInverseDepth
 from vio.errors import RecordingError
+from vio.image_files import decode_image
 from vio.imu import ImuSamples, check_coverage
 from vio.trajectory import Trajectory
+from vio.video_frames import VideoFrames
 
 Array = NDArray[np.float64]
 Image = NDArray[np.uint8]
 
 NS = 1e-9
-IMAGE_ENDS = {b"\x89PNG": b"IEND\xaeB`\x82", b"\xff\xd8": b"\xff\xd9"}  # how a whole PNG and JPEG start and end
 
 
 @dataclass(frozen=True)
@@ -58,13 +60,17 @@ class Recording:
     frame_paths: tuple[Path | None, ...] = ()
     """Image file of every frame, whether it exists or not; None (or an empty tuple) where none was recorded."""
     depth_paths: tuple[Path | None, ...] = ()
-    """16-bit z-depth image of every frame; None (or an empty tuple) where there is none."""
+    """Depth image of every frame; None (or an empty tuple) where there is none."""
     provenance: dict[str, Any] = field(default_factory=dict)
     """Where the recording comes from: simulator version, seed, organ, vibration; empty when unknown."""
     depth_unit_m: float = 1e-3
-    """Metres per count of the depth images."""
+    """Metres per count of depth images that are plain 16-bit z-depth."""
     truth_state: TruthState | None = None
     """Velocity and biases at every pose of `truth`."""
+    depth_encoding: DepthEncoding | None = None
+    """How the depth images are stored where they are not plain 16-bit z-depth in `depth_unit_m`."""
+    video: VideoFrames | None = None
+    """Decodes the frames of a recording that is a film; `frame_paths` are None then."""
 
     def __post_init__(self) -> None:
         t = np.asarray(self.frame_t_ns)
@@ -84,6 +90,8 @@ class Recording:
             object.__setattr__(self, name, paths)
         if not (np.isfinite(self.depth_unit_m) and self.depth_unit_m > 0):
             raise RecordingError(f"recording {self.name}: depth_unit_m is {self.depth_unit_m}, must be positive metres")
+        if self.video is not None and len(self.video) != len(t):
+            raise RecordingError(f"recording {self.name}: {len(t)} frames but a film of {len(self.video)}")
         if self.truth_state is not None:
             poses = 0 if self.truth is None else len(self.truth)
             if len(self.truth_state.velocity_m_s) != poses:
@@ -110,13 +118,23 @@ class Recording:
 
     @property
     def has_images(self) -> bool:
-        """Whether the image file of every frame exists."""
-        return all(path is not None and path.is_file() for path in self.frame_paths)
+        """Whether every frame has its image: a file that exists, or a place in the film."""
+        return self.video is not None or all(path is not None and path.is_file() for path in self.frame_paths)
 
     @property
     def has_depth(self) -> bool:
-        """Whether the depth image of at least one frame exists."""
+        """Whether z-depth in metres can be had for at least one frame."""
+        return self.stored_depth.metric and self.has_depth_images
+
+    @property
+    def has_depth_images(self) -> bool:
+        """Whether the depth image of at least one frame exists, metric or relative."""
         return any(path is not None and path.is_file() for path in self.depth_paths)
+
+    @property
+    def stored_depth(self) -> DepthEncoding:
+        """How the depth images are stored."""
+        return self.depth_encoding or LinearDepth(self.depth_unit_m)
 
     def frame(self, k: int) -> Image:
         """Image of frame k as stored: grey (H, W) or colour (H, W, 3) in R, G, B order.
@@ -125,26 +143,51 @@ class Recording:
             RecordingError: no such frame, its file is absent, cut off or undecodable, or its size is not the camera's.
         """
         path = self.frame_paths[self._index(k)]
-        if path is None:
+        if self.video is not None:
+            image: Image = self.video.read(k)
+        elif path is None:
             raise RecordingError(f"frame {k}: this recording lists frame times but no images")
-        image = _decode(path, f"frame {k}", depth=False)
+        else:
+            image = decode_image(path, f"frame {k}")
+            image = image[..., ::-1].copy() if image.ndim == 3 else image
         camera = self.calibration.camera
         height, width = image.shape[:2]
         if camera is not None and (width, height) != (camera.width, camera.height):
-            raise RecordingError(f"frame {k} ({path.name}) has {width} x {height} pixels but the camera {camera.width} "
-                                 f"x {camera.height}; correct `resolution` and `intrinsics` in cam0/sensor.yaml")
-        return image[..., ::-1].copy() if image.ndim == 3 else image
+            where = f"frame {k}" if path is None else f"frame {k} ({path.name})"
+            raise RecordingError(f"{where} has {width} x {height} pixels but the camera {camera.width} x "
+                                 f"{camera.height}; correct the camera's `resolution` and `intrinsics`")
+        return image
 
     def depth_m(self, k: int) -> NDArray[np.float32] | None:
         """z-depth (H, W) of frame k in metres, 0 where unknown; None when no depth was recorded for the frame.
 
         Raises:
-            RecordingError: no such frame, or its depth file is absent, cut off, undecodable or not 16-bit.
+            RecordingError: no such frame, its depth file is absent, cut off, undecodable or of another kind than
+                `depth_encoding` says, or the images hold depth up to an unknown factor.
         """
+        stored = self._depth_image(k)
+        return None if stored is None else self.stored_depth.depth_m(*stored)
+
+    def relative_inverse_depth(self, k: int) -> NDArray[np.float32] | None:
+        """Inverse z-depth (H, W) of frame k up to one unknown factor, 0 where unknown; None as `depth_m`.
+
+        Raises:
+            RecordingError: as `depth_m`, except that the factor need not be known.
+        """
+        stored, encoding = self._depth_image(k), self.stored_depth
+        if stored is None:
+            return None
+        if isinstance(encoding, RelativeInverseDepth):
+            return encoding.inverse(*stored)
+        depth = encoding.depth_m(*stored)
+        return np.divide(1, depth, out=np.zeros_like(depth), where=depth > 0)
+
+    def _depth_image(self, k: int) -> tuple[NDArray[Any], str] | None:
+        """The decoded depth image of frame k, and what it is in messages."""
         path = self.depth_paths[self._index(k)]
         if path is None:
             return None
-        return read_depth_image(path, f"depth of frame {k}", self.depth_unit_m)
+        return decode_image(path, f"depth of frame {k}", depth=True), f"depth of frame {k} ({path.name})"
 
     def truth_at_frames(self) -> Trajectory:
         """Truth interpolated at the times of the frames that it covers.
@@ -183,34 +226,3 @@ def check_refinable(recording: Recording) -> Recording:
     check_coverage(recording.imu_t_s, recording.frame_t_s)
     return recording
 
-
-def read_depth_image(path: Path, what: str, unit_m: float) -> NDArray[np.float32]:
-    """z-depth (H, W) of a 16-bit image in metres, 0 where unknown; `what` names it in messages.
-
-    Raises:
-        RecordingError: the file is absent, cut off, undecodable or not 16-bit.
-    """
-    counts = _decode(path, what, depth=True)
-    if counts.dtype != np.uint16 or counts.ndim != 2:
-        raise RecordingError(f"{what} ({path.name}) is {counts.dtype} with shape {counts.shape}; "
-                             "give a 16-bit image with one channel")
-    return (counts * np.float32(unit_m)).astype(np.float32)
-
-
-def _decode(path: Path, what: str, depth: bool) -> NDArray[Any]:
-    """Decode an image file; one that is cut off is refused, for decoders may fill it up with another image's pixels."""
-    import cv2  # heavy, and needed only once somebody looks at an image
-
-    try:
-        content = path.read_bytes()
-    except OSError as error:
-        reason = error.strerror or "input error"
-        raise RecordingError(f"{what}: {short_name(path)} cannot be read ({reason}); restore the file") from None
-    for start, end in IMAGE_ENDS.items():
-        if content.startswith(start) and end not in content[-64:]:
-            raise RecordingError(f"{what}: {short_name(path)} is cut off; copy the file again")
-    flags = cv2.IMREAD_UNCHANGED if depth else cv2.IMREAD_ANYCOLOR | cv2.IMREAD_IGNORE_ORIENTATION
-    image = cv2.imdecode(np.frombuffer(content, np.uint8), flags) if content else None
-    if image is None:
-        raise RecordingError(f"{what}: {short_name(path)} is not an image that can be decoded; restore the file")
-    return np.asarray(image)

@@ -177,14 +177,16 @@ def check_transforms(T: ArrayLike, name: str) -> Array:
     if not finite.all():
         raise GeometryError(f"{name}[{np.argmin(finite)}]: a value is not finite; drop or repair that entry")
     R = flat[:, :3, :3]
-    off = np.abs(np.swapaxes(R, 1, 2) @ R - np.eye(3)).max(axis=(1, 2), initial=0.0)
     row = np.abs(flat[:, 3] - [0, 0, 0, 1]).max(axis=1, initial=0.0)
-    bad = (off > ORTHONORMAL_TOLERANCE) | (row > 1e-9) | (np.linalg.det(R) <= 0)
+    with np.errstate(over="ignore", invalid="ignore"):  # absurd numbers are found bad below
+        off = np.abs(np.swapaxes(R, 1, 2) @ R - np.eye(3)).max(axis=(1, 2), initial=0.0)
+        determinant = np.linalg.det(R)
+    bad = ~((off <= ORTHONORMAL_TOLERANCE) & (row <= 1e-9) & (determinant > 0))
     if bad.any():
         k = int(np.argmax(bad))
         raise GeometryError(
             f"{name}[{k}]: not a rigid transform (|RᵀR - I| = {off[k]:.2g}, limit {ORTHONORMAL_TOLERANCE:g}, "
-            f"det {np.linalg.det(R[k]):.3g}); check row/column order, units and handedness"
+            f"det {determinant[k]:.3g}); check row/column order, units and handedness"
         )
     flat[:, :3, :3] = _rotation(R).as_matrix() if len(R) else R
     return flat.reshape(T.shape)

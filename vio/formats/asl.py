@@ -1,14 +1,13 @@
 """The ASL layout of EuRoC (Burri et al. 2016), in and out: `mav0/{cam0,imu0,...}/data.csv` and `sensor.yaml`.
 
-Stamps are int64 nanoseconds and stay so. `T_BS` maps sensor to body, body = IMU. Truth is the pose of the
-body in a world with z up; its quaternions are w, x, y, z. Ours beside the original: `depth0` with 16-bit z-depth, and
-`recording.yaml` with provenance.
+Stamps are int64 nanoseconds and stay so. `T_BS` maps sensor to body, body = IMU. Truth is the pose of the body in a
+world with z up; its quaternions are w, x, y, z. Ours beside the original: `depth0` with 16-bit z-depth (or with
+inverse depth up to a factor, marked in its `sensor.yaml`), and `recording.yaml` with provenance. A recording without
+`imu0` has no inertial samples, one whose `cam0/sensor.yaml` describes no camera has an unknown camera.
 """
 
 from __future__ import annotations
 
-import shutil
-from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -28,7 +27,9 @@ from vio.calibration import (
     number,
     short_name,
 )
+from vio.depth import DepthEncoding
 from vio.errors import CalibrationError, FormatError, ImuError, RecordingError
+from vio.formats.asl_images import CAMERA_HEADER, Progress, depth_encoding_from_asl, write_depth, write_frames
 from vio.formats.asl_truth import TRUTH, write_asl_truth
 from vio.formats.asl_truth import read_asl_truth as read_asl_truth
 from vio.formats.table import TextTable, parse_floats, parse_stamps, read_table, write_stamped_rows
@@ -38,7 +39,7 @@ from vio.recording import Recording
 SCHEMA = 1
 MARKER = "recording.yaml"
 LAYOUT = "ASL/EuRoC: mav0/cam0/data.csv and mav0/imu0/data.csv"
-CAMERA_HEADER = "#timestamp [ns],filename"
+CAMERA_KEYS = {"camera_model", "intrinsics", "distortion_model", "distortion_coefficients", "resolution"}
 IMU_HEADER = "#timestamp [ns],w_x [rad/s],w_y [rad/s],w_z [rad/s],a_x [m/s^2],a_y [m/s^2],a_z [m/s^2]"
 
 
@@ -57,18 +58,17 @@ def read_asl(path: str | Path) -> Recording:
         CalibrationError: a calibration key is missing or impossible, naming file and key.
     """
     root, mav0 = _folders(Path(path))
-    for part, why in (("cam0", "frame times are needed even without images"), ("imu0", "inertial samples are needed")):
-        if not (mav0 / part / "data.csv").is_file():
-            raise RecordingError(f"{root.name}: no {part}/data.csv; {why}")
+    has_imu = (mav0 / "imu0").is_dir()
+    _check_tables(root.name, mav0, ("cam0", "imu0") if has_imu else ("cam0",))
     frame_t_ns, frame_paths = _read_listing(mav0 / "cam0")
     calibration = _read_calibration(mav0, any(file.is_file() for file in frame_paths))
-    depth_paths, depth_unit_m = _read_depth(mav0 / "depth0", frame_t_ns)
+    depth_paths, depth_unit_m, depth_encoding = _read_depth(mav0 / "depth0", frame_t_ns)
     truth_file = mav0 / TRUTH / "data.csv"
     truth = read_asl_truth(truth_file, int(frame_t_ns[0])) if truth_file.is_file() else None
     return Recording(
         name=root.name,
         frame_t_ns=frame_t_ns,
-        imu=read_asl_imu(mav0 / "imu0" / "data.csv"),
+        imu=read_asl_imu(mav0 / "imu0" / "data.csv") if has_imu else ImuSamples.none(),
         calibration=calibration,
         truth=None if truth is None else truth.trajectory,
         frame_paths=frame_paths,
@@ -76,7 +76,15 @@ def read_asl(path: str | Path) -> Recording:
         provenance=_read_provenance(root / MARKER),
         depth_unit_m=depth_unit_m,
         truth_state=None if truth is None else truth.state,
+        depth_encoding=depth_encoding,
     )
+
+
+def _check_tables(name: str, mav0: Path, parts: tuple[str, ...]) -> None:
+    why = {"cam0": "frame times are needed even without images", "imu0": "inertial samples are needed"}
+    for part in parts:
+        if not (mav0 / part / "data.csv").is_file():
+            raise RecordingError(f"{name}: no {part}/data.csv; {why[part]}")
 
 
 def read_asl_imu(path: str | Path) -> ImuSamples:
@@ -94,34 +102,43 @@ def read_asl_imu(path: str | Path) -> ImuSamples:
     return ImuSamples(t_ns, values[:, :3].copy(), values[:, 3:].copy())
 
 
-def write_asl(recording: Recording, out: str | Path) -> None:
+def write_asl(
+    recording: Recording, out: str | Path, *, check: bool = False, progress: Progress | None = None
+) -> None:
     """Write a recording as a whole folder, or nothing. Image files that exist are copied, the others only listed.
 
-    An existing folder is replaced only if it holds `recording.yaml`. Truth without a `TruthState` has 8 columns.
+    An existing folder is replaced only if it holds `recording.yaml`. Truth without a `TruthState` has 8 columns;
+    without inertial samples there is no `imu0`.
+
+    Args:
+        recording: what to write.
+        out: the folder.
+        check: decode every frame on the way, so that a damaged one refuses the whole.
+        progress: called with (frames done, frames in all).
 
     Raises:
+        RecordingError: a film ends too early, depth that must be converted is damaged, or (with `check`) a frame is.
         OutputError: `out` exists and is not ours, or cannot be written.
     """
     with atomic_folder(out, MARKER) as folder:
-        write_asl_files(recording, folder)
+        write_asl_files(recording, folder, check, progress)
 
 
-def write_asl_files(recording: Recording, folder: Path) -> None:
+def write_asl_files(recording: Recording, folder: Path, check: bool = False, progress: Progress | None = None) -> None:
     """Write the files of `write_asl` into an existing folder, for a caller that adds more before it is whole."""
     mav0 = folder / "mav0"
     t_ns = recording.frame_t_ns
     rate_hz = 1e9 / float(np.median(np.diff(t_ns))) if len(t_ns) > 1 else None
     _write_sensor(mav0 / "cam0", camera_to_asl(recording.calibration, rate_hz))
-    _write_listing(mav0 / "cam0", t_ns, recording.frame_paths)
-    _write_sensor(mav0 / "imu0", imu_to_asl(recording.calibration))
-    inertial = np.hstack([recording.imu.gyro_rad_s, recording.imu.accel_m_s2])
-    write_stamped_rows(mav0 / "imu0" / "data.csv", IMU_HEADER, recording.imu.t_ns, inertial)
+    write_frames(mav0 / "cam0", recording, check, progress)
+    if len(recording.imu):
+        _write_sensor(mav0 / "imu0", imu_to_asl(recording.calibration))
+        inertial = np.hstack([recording.imu.gyro_rad_s, recording.imu.accel_m_s2])
+        write_stamped_rows(mav0 / "imu0" / "data.csv", IMU_HEADER, recording.imu.t_ns, inertial)
     if recording.truth is not None:
         write_asl_truth(mav0 / TRUTH / "data.csv", recording.truth, recording.truth_state, int(t_ns[0]))
-    if recording.has_depth:
-        listed = [k for k, file in enumerate(recording.depth_paths) if file is not None]
-        _write_sensor(mav0 / "depth0", {"sensor_type": "depth", "depth_unit_m": float(recording.depth_unit_m)})
-        _write_listing(mav0 / "depth0", t_ns[listed], [recording.depth_paths[k] for k in listed])
+    if recording.has_depth_images:
+        _write_sensor(mav0 / "depth0", write_depth(mav0 / "depth0", recording))
     (folder / MARKER).write_text(_provenance_text(recording), encoding="utf-8")
 
 
@@ -154,35 +171,44 @@ def _file_name(table: TextTable, row: int) -> str:
 def _read_calibration(mav0: Path, images: bool) -> Calibration:
     camera_file, imu_file = mav0 / "cam0" / "sensor.yaml", mav0 / "imu0" / "sensor.yaml"
     data, name = load_yaml(camera_file), short_name(camera_file)
-    camera = camera_from_asl(data, name) if images or "intrinsics" in data else None
+    described = "intrinsics" in data or (images and not CAMERA_KEYS.isdisjoint(data))
+    camera = camera_from_asl(data, name) if described else None
+    T_body_camera = T_body_sensor_from_asl(data, name)
+    if not imu_file.parent.is_dir():
+        return Calibration(camera, T_body_camera)
     noise, offset_s = imu_from_asl(load_yaml(imu_file), short_name(imu_file))
-    return Calibration(camera, T_body_sensor_from_asl(data, name), noise, offset_s)
+    return Calibration(camera, T_body_camera, noise, offset_s)
 
 
-def _read_depth(sensor: Path, frame_t_ns: NDArray[np.int64]) -> tuple[tuple[Path | None, ...], float]:
-    """Depth file of every frame (matched by equal stamps) and metres per count."""
+def _read_depth(
+    sensor: Path, frame_t_ns: NDArray[np.int64]
+) -> tuple[tuple[Path | None, ...], float, DepthEncoding | None]:
+    """Depth file of every frame (matched by equal stamps), metres per count, and how they are stored if not plainly."""
     if not (sensor / "data.csv").is_file():
-        return (), 1e-3
-    t_ns, files, unit_m = read_depth_listing(sensor)
+        return (), 1e-3, None
+    t_ns, files, unit_m, encoding = read_depth_listing(sensor)
     stray = ~np.isin(t_ns, frame_t_ns)
     if stray.any():
         raise FormatError(f"{short_name(sensor / 'data.csv')}: stamp {t_ns[np.argmax(stray)]} is no frame of cam0; "
                           "depth images carry the stamp of their frame")
     by_stamp = dict(zip(t_ns.tolist(), files, strict=True))
-    return tuple(by_stamp.get(t) for t in frame_t_ns.tolist()), unit_m
+    return tuple(by_stamp.get(t) for t in frame_t_ns.tolist()), unit_m, encoding
 
 
-def read_depth_listing(sensor: Path) -> tuple[NDArray[np.int64], tuple[Path, ...], float]:
-    """Stamps (N,) and files of a folder of depth images laid out as `mav0/depth0`, and metres per count.
+def read_depth_listing(
+    sensor: Path,
+) -> tuple[NDArray[np.int64], tuple[Path, ...], float, DepthEncoding | None]:
+    """Stamps (N,) and files of a folder laid out as `mav0/depth0`, metres per count, and the encoding if not plain.
 
     Raises:
         VioError: `data.csv` or `sensor.yaml` is missing or unusable, naming file and line.
     """
-    name = short_name(sensor / "sensor.yaml")
-    unit_m = number(load_yaml(sensor / "sensor.yaml"), "depth_unit_m", name)
+    name, data = short_name(sensor / "sensor.yaml"), load_yaml(sensor / "sensor.yaml")
+    encoding = depth_encoding_from_asl(data, name)
+    unit_m = number(data, "depth_unit_m", name) if encoding is None else 1e-3
     if unit_m <= 0:
         raise CalibrationError(f"{name}: depth_unit_m is {unit_m:g}, must be positive metres")
-    return *_read_listing(sensor), unit_m
+    return *_read_listing(sensor), unit_m, encoding
 
 
 def _read_provenance(path: Path) -> dict[str, Any]:
@@ -213,20 +239,12 @@ def _write_sensor(sensor: Path, data: dict[str, Any]) -> None:
     (sensor / "sensor.yaml").write_text("".join(lines), encoding="utf-8")
 
 
+
 def write_image_stream(sensor: Path, t_ns: NDArray[np.int64], description: dict[str, Any],
                        suffix: str = ".png") -> Path:
     """Start a stream of one file per stamp beside cam0: `sensor.yaml`, `data.csv`, and the empty `data`, returned."""
-    _write_sensor(sensor, description)
-    _write_listing(sensor, t_ns, [Path(f"{t}{suffix}") for t in t_ns.tolist()])
-    return sensor / "data"
-
-
-def _write_listing(sensor: Path, t_ns: NDArray[np.int64], files: Iterable[Path | None]) -> None:
     (sensor / "data").mkdir(parents=True)
-    rows = [CAMERA_HEADER]
-    for t, file in zip(t_ns.tolist(), files, strict=True):
-        name = f"{t}.png" if file is None else f"{t}{file.suffix}"
-        if file is not None and file.is_file():
-            shutil.copyfile(file, sensor / "data" / name)
-        rows.append(f"{t},{name}")
+    _write_sensor(sensor, description)
+    rows = [CAMERA_HEADER, *(f"{t},{t}{suffix}" for t in t_ns.tolist())]
     (sensor / "data.csv").write_text("\n".join(rows) + "\n", encoding="utf-8")
+    return sensor / "data"

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from decimal import Decimal, InvalidOperation, Overflow
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +15,7 @@ from vio.errors import FormatError, VioError
 
 Array = NDArray[np.float64]
 QUATERNION_TOLERANCE = 1e-3
+LARGEST_NS = 2**62  # so that no difference of two overflows; 146 years
 
 
 @dataclass(frozen=True)
@@ -32,21 +35,37 @@ class TextTable:
         return f"{self.name} line {self.lines[row]}"
 
 
-def read_table(path: Path, error: type[VioError] = FormatError) -> TextTable:
-    """Split a text file into rows; blank lines, `#` comments and a title line are set apart.
+def read_text(path: Path, error: type[VioError] = FormatError) -> str:
+    """The whole text of a UTF-8 file.
 
     Raises:
         error: the file is missing or is not text.
     """
     name = short_name(path)
     try:
-        text = path.read_text(encoding="utf-8-sig")
+        return path.read_text(encoding="utf-8-sig")
     except FileNotFoundError:
         raise error(f"{name}: no such file") from None
     except UnicodeDecodeError:
-        raise error(f"{name}: not a text file; give comma or space separated numbers") from None
+        raise error(f"{name}: not a text file in UTF-8; save it again as UTF-8 text with plain numbers") from None
     except OSError as problem:
         raise error(f"{name}: cannot be read ({problem.strerror})") from None
+
+
+def read_table(path: Path, error: type[VioError] = FormatError, drop_unfinished: bool = False) -> TextTable:
+    """Split a text file into rows; blank lines, `#` comments and a title line are set apart.
+
+    Args:
+        path: the file.
+        error: what to raise.
+        drop_unfinished: leave out a last line without a line end: whoever wrote the file was cut off.
+
+    Raises:
+        error: the file is missing or is not text.
+    """
+    text = read_text(path, error)
+    if drop_unfinished:
+        text = text[: text.rfind("\n") + 1]
     header: list[str] = []
     rows: list[str] = []
     lines: list[int] = []
@@ -57,10 +76,10 @@ def read_table(path: Path, error: type[VioError] = FormatError) -> TextTable:
         elif row:
             rows.append(row)
             lines.append(number)
-    return TextTable(name, " ".join(header), rows, lines)
+    return TextTable(short_name(path), " ".join(header), rows, lines)
 
 
-def parse_floats(table: TextTable, columns: range, delimiter: str | None, error: type[VioError]) -> Array:
+def parse_floats(table: TextTable, columns: Sequence[int], delimiter: str | None, error: type[VioError]) -> Array:
     """The given columns of every row as floats (N, len(columns)); further columns are ignored.
 
     Raises:
@@ -92,6 +111,51 @@ def parse_stamps(table: TextTable, error: type[VioError]) -> NDArray[np.int64]:
             stamps[k] = int(field)
         except (ValueError, OverflowError):
             raise error(f"{table.at(k)}: stamp {field!r} is not a whole number of nanoseconds") from None
+    return check_increasing(stamps, table, error)
+
+
+def parse_times(
+    fields: Sequence[str], ns_per_unit: int, table: TextTable, error: type[VioError], repair: bool = False
+) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
+    """Decimal times, one per row, as int64 nanoseconds, never by way of floating point.
+
+    Args:
+        fields: the text of every time.
+        ns_per_unit: 10^9 for seconds, 1 for nanoseconds.
+        table: where they come from.
+        error: what to raise.
+        repair: drop the later ones of equal times instead of refusing them.
+
+    Returns:
+        The times that are kept, and which rows (N,) they are.
+
+    Raises:
+        error: a time that is no number, beyond 64 bits, or not later than the one before, naming its line.
+    """
+    stamps = np.empty(len(fields), np.int64)
+    for k, field in enumerate(fields):
+        try:
+            exact = Decimal(field.strip()) * ns_per_unit
+        except (InvalidOperation, Overflow):
+            exact = Decimal("nan")
+        if not (exact.is_finite() and -LARGEST_NS < exact < LARGEST_NS):
+            raise error(f"{table.at(k)}: time {field.strip()[:40]!r} is no number of 64 bits in nanoseconds; write "
+                        "decimals with a point")
+        stamps[k] = round(exact)
+    keep = np.ones(len(stamps), bool)
+    if repair:
+        keep[1:] = stamps[1:] != stamps[:-1]
+    rows = np.flatnonzero(keep)
+    kept = TextTable(table.name, table.header, [table.rows[k] for k in rows], [table.lines[k] for k in rows])
+    return check_increasing(stamps[keep], kept, error), keep
+
+
+def check_increasing(stamps: NDArray[np.int64], table: TextTable, error: type[VioError]) -> NDArray[np.int64]:
+    """Return stamps (N,) if every one is later than the one before.
+
+    Raises:
+        error: one is not, naming its line.
+    """
     bad = stamps[1:] <= stamps[:-1]
     if bad.any():
         k = int(np.argmax(bad)) + 1
@@ -125,11 +189,11 @@ def write_stamped_rows(path: Path, header: str, t_ns: NDArray[np.int64], values:
         file.writelines(line % (t, *row) for t, row in zip(t_ns.tolist(), values.tolist(), strict=True))
 
 
-def _find_bad_row(table: TextTable, columns: range, delimiter: str | None) -> str:
+def _find_bad_row(table: TextTable, columns: Sequence[int], delimiter: str | None) -> str:
     for k, row in enumerate(table.rows):
         fields = row.split(delimiter)
-        if len(fields) < columns.stop:
-            return f"{table.at(k)}: {len(fields)} columns, expected at least {columns.stop}"
+        if len(fields) <= max(columns):
+            return f"{table.at(k)}: {len(fields)} columns, expected at least {max(columns) + 1}"
         for column in columns:
             try:
                 float(fields[column])

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from vio.atomic import atomic_folder
 from vio.errors import SimulationError
 from vio.formats.asl import MARKER, write_asl_files, write_image_stream
+from vio.formats.asl_images import write_png
 from vio.simulation.scenario import Simulation
 from vio.simulation.sightings import Sighting, find_sightings, known_marks, write_marks
 
@@ -100,15 +101,15 @@ class _FrameWriter:
     def write(self, k: int, frame: Frame, t_next_s: float) -> None:
         """Write the files of frame k; scene flow leads to the frame at `t_next_s`."""
         stamp = int(self._t_ns[k])
-        _write_png(self._colour / f"{stamp}.png", frame.rgb)
+        write_png(self._colour / f"{stamp}.png", frame.rgb[..., ::-1])
         counts = np.minimum(np.round(frame.z_depth_m / np.float32(DEPTH_UNIT_M)), 65535)
-        _write_png(self._depth / f"{stamp}.png", counts.astype(np.uint16))
+        write_png(self._depth / f"{stamp}.png", counts.astype(np.uint16))
         self._gains.append(f"{stamp},{frame.gain:.6g}")
         for name in self._products:
             if name == "flow":
                 np.save(self._extra[name] / f"{stamp}.npy", self._renderer.scene_flow(frame, t_next_s))
             else:
-                _write_png(self._extra[name] / f"{stamp}.png", _encoded(name, frame))
+                write_png(self._extra[name] / f"{stamp}.png", _encoded(name, frame))
 
     def finish(self) -> None:
         """Write what is known only at the end."""
@@ -116,24 +117,9 @@ class _FrameWriter:
 
 
 def _encoded(product: str, frame: Frame) -> NDArray[np.uint16] | NDArray[np.uint8]:
+    """One product as an image, colours in B, G, R order."""
     if product == "normals":
-        return np.round((frame.normal + 1) * np.float32(32767.5)).astype(np.uint16)
+        return np.round((frame.normal[..., ::-1] + 1) * np.float32(32767.5)).astype(np.uint16)
     if product == "albedo":
-        return np.round(frame.albedo * np.float32(65535)).astype(np.uint16)
+        return np.round(frame.albedo[..., ::-1] * np.float32(65535)).astype(np.uint16)
     return np.where(frame.valid, 255, 0).astype(np.uint8)
-
-
-def _write_png(path: Path, image: NDArray[np.uint8] | NDArray[np.uint16]) -> None:
-    """Write one image; colour is R, G, B.
-
-    Raises:
-        OSError: the disk is full or the folder is gone.
-    """
-    import cv2  # heavy, and only images need it
-
-    coded, content = cv2.imencode(".png", image[..., ::-1] if image.ndim == 3 else image,
-                                  [cv2.IMWRITE_PNG_COMPRESSION, 1, cv2.IMWRITE_PNG_STRATEGY,
-                                   cv2.IMWRITE_PNG_STRATEGY_RLE])
-    if not coded:
-        raise OSError("the image could not be encoded")
-    path.write_bytes(content.tobytes())

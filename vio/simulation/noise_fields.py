@@ -39,16 +39,17 @@ class BandNoise:
         self._amplitude = _band((self._rows, columns), pixel_m, shortest_m, longest_m, fall)
         ramp = (np.arange(self._overlap, dtype=np.float32) + 0.5) / self._overlap * np.float32(np.pi / 2)
         self._rising, self._falling = np.sin(ramp)[:, None], np.cos(ramp)[:, None]
-        self._blocks = Recent(self._block_values, blocks_kept)
+        self._blocks: Recent[Field] = Recent(blocks_kept)
 
     def rows(self, first: int, last: int) -> Field:
         """Values (last - first, columns) float32 of rows `first` (may be negative) up to `last`, exclusive."""
         blocks = range(first // self._block, (last - 1) // self._block + 1)
         parts = []
         for k in blocks:
-            whole = self._blocks.get(k)[: self._block].copy()
+            whole = self._blocks.get(k, self._block_values)[: self._block].copy()
             whole[: self._overlap] *= self._rising
-            whole[: self._overlap] += self._falling * self._blocks.get(k - 1)[self._block:][: self._overlap]
+            before = self._blocks.get(k - 1, self._block_values)
+            whole[: self._overlap] += self._falling * before[self._block:][: self._overlap]
             parts.append(whole)
         start = blocks[0] * self._block
         return np.concatenate(parts)[first - start: last - start]
@@ -61,34 +62,32 @@ class BandNoise:
 
 
 class Recent(Generic[Item]):
-    """Things with a number, made when they are asked for; the most recent ones are kept."""
+    """Things with a number, made when they are asked for; the most recent ones are kept.
 
-    def __init__(self, make: Callable[[int], Item], kept: int) -> None:
-        self._make, self._kept = make, kept
+    How to make one is said at every call: a stored method would tie its owner into a cycle, and large arrays would wait
+    for the garbage collector.
+    """
+
+    def __init__(self, kept: int) -> None:
+        self._kept = kept
         self._items: OrderedDict[int, Item] = OrderedDict()
 
-    def get(self, k: int) -> Item:
-        """Item k."""
+    def get(self, k: int, make: Callable[[int], Item]) -> Item:
+        """Item k, made by `make(k)` if it is not kept."""
         if k not in self._items:
-            self._items[k] = self._make(k)
+            self._items[k] = make(k)
         self._items.move_to_end(k)
         while len(self._items) > self._kept:
             self._items.popitem(last=False)
         return self._items[k]
 
 
-class BlockRows:
-    """Rows of an endless array that is made block by block."""
-
-    def __init__(self, make: Callable[[int], Field], block: int, kept: int) -> None:
-        self._block, self._blocks = block, Recent(make, kept)
-
-    def rows(self, first: int, last: int) -> Field:
-        """Rows `first` (at least 0) up to `last`, exclusive; the array is the caller's own."""
-        numbers = range(first // self._block, (last - 1) // self._block + 1)
-        joined = np.concatenate([self._blocks.get(k) for k in numbers])
-        start = numbers[0] * self._block
-        return joined[first - start: last - start]
+def block_rows(blocks: Recent[Field], block: int, first: int, last: int, make: Callable[[int], Field]) -> Field:
+    """Rows `first` (at least 0) up to `last`, exclusive, of an endless array made in blocks; the caller's own copy."""
+    numbers = range(first // block, (last - 1) // block + 1)
+    joined = np.concatenate([blocks.get(k, make) for k in numbers])
+    start = numbers[0] * block
+    return joined[first - start: last - start]
 
 
 def _band(shape: tuple[int, int], pixel_m: tuple[float, float], shortest_m: float, longest_m: float,

@@ -93,7 +93,7 @@ ORGANS = {
         code=2, length_m=5.50, semi_axes_m=(0.11, 0.07, 0.10), bend_radius_m=0.04, tightest_radius_m=0.024,
         bend_length_m=0.03, radius_m=12.5e-3, radius_variation=0.10, folds="circular", view_m=0.13,
         waves=Waves(per_minute=9.0, speed_m_s=10e-3, width_m=9e-3, amplitude=0.12),
-        look=Look(albedo=(0.70, 0.36, 0.19), vessels_per_m2=1100.0, vessel_density=0.35, relief_mm=(0.075, 0.03),
+        look=Look(albedo=(0.70, 0.36, 0.19), vessels_per_m2=1100.0, vessel_density=0.35, relief_mm=(0.045, 0.03),
                   villi=True, bile=0.25, foam=14.0, debris=6.0),
         lesions_per_m=12.0, lesion_kinds=("ulcer", "bleeding", "angioectasia"),
         landmarks=("pylorus", "ileocecal valve"), speed_factor=1.0, transit_factor=1.0, tumble_gap_s=40.0),

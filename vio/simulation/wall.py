@@ -15,7 +15,7 @@ from scipy.ndimage import gaussian_filter, gaussian_filter1d
 
 from vio.simulation.folds import make_folds
 from vio.simulation.marks import Mark, draw_landmarks, draw_lesions, draw_residue, relief, stain
-from vio.simulation.noise_fields import BandNoise, BlockRows, Field
+from vio.simulation.noise_fields import BandNoise, Field, Recent, block_rows
 from vio.simulation.organs import Organ
 
 Array = NDArray[np.float64]
@@ -56,15 +56,15 @@ class Wall:
         self.lesions = tuple(self._clear_of_landmarks(draw_lesions(organ, inner, rng)))
         self.residue = tuple(draw_residue(organ, inner, rng))
         self._marks = (*self.residue, *self.lesions, *self.landmarks)
-        self._sections = BlockRows(self._section, _SECTION, _SECTIONS_KEPT)
+        self._sections: Recent[Field] = Recent(_SECTIONS_KEPT)
 
     def radius_m(self, first: int, last: int) -> Field:
         """Radius (last - first, columns) [m] at rest."""
-        return np.ascontiguousarray(self._sections.rows(first, last)[..., 0])
+        return np.ascontiguousarray(self.maps(first, last)[..., 0])
 
     def maps(self, first: int, last: int) -> Field:
         """Radius [m], texture shift along the wall [m], and optical density R, G, B: (last - first, columns, 5)."""
-        return self._sections.rows(first, last)
+        return block_rows(self._sections, _SECTION, first, last, self._section)
 
     def row_at(self, arc_m: Array) -> Array:
         """Fractional row of the wall (n,) whose centre lies at arc length (n,) [m] of the centreline."""
@@ -109,7 +109,7 @@ class Wall:
             return np.zeros_like(radius)
         slope = np.gradient(radius, ROW_M, axis=0)
         extra = np.cumsum(np.sqrt(1 + slope * slope) - 1, axis=0) * ROW_M
-        high = extra - gaussian_filter(extra, (20, 6), mode=("nearest", "wrap"))
+        high = extra - gaussian_filter1d(extra, 20, axis=0, mode="nearest")
         out: Field = np.float32(share) * gaussian_filter(high, (2, 3), mode=("nearest", "wrap"))
         return out
 

@@ -14,7 +14,7 @@ Field = NDArray[np.float32]
 
 _TARGET = 0.20  # mean of the exposed image that auto-exposure aims at
 _BRIGHTEST = 97  # percentile at which highlights stop counting
-_SHOT, _READ = np.float32(6e-4), np.float32(2e-5)
+_SHOT, _READ = np.float32(2.5e-4), np.float32(1e-5)
 _SHOULDER = 0.7
 _LINEAR_MAX = 4.0
 

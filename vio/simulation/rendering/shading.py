@@ -135,7 +135,7 @@ def shade(distance: Array, row: Array, column: Array, rays: Array, pixel_rad: fl
             t8[c] = _mix(texture[iy, ix, c], texture[iy, ix1, c], texture[iy + 1, ix, c], texture[iy + 1, ix1, c],
                          fy, fx)
         # slopes per metre of texture become slopes per metre of the stretched wall
-        pinch = switches[2] * min(1.0, 2 * r / base_radius_m)  # textures run together at the poles
+        pinch = switches[2] * min(1.0, (2 * r / base_radius_m) ** 2)  # textures run together at the poles
         gs, gt = pinch * ROW_M / ls, pinch * min(base_radius_m / lt, 1.6)
         hs, ht = t8[3] * gs, t8[4] * gt
         smooth = min(1.0, ROW_M / ls)  # a film that is stretched along is smoothed around too: no streaks

@@ -58,7 +58,7 @@ class Textures:
         self._fine = BandNoise((*seed, 23), self.columns, fine, 0.35e-3, 1.6e-3, blocks_kept=2)
         grain = {"circular": (0.45e-3, 1.1e-3), "haustral": (0.9e-3, 2.2e-3), "rugae": (1.5e-3, 4e-3)}[organ.folds]
         self._grain = BandNoise((*seed, 24), self.columns, fine, *grain, blocks_kept=2)
-        self._sections = Recent(lambda k: _mip_levels(self._make(k)), _SECTIONS_KEPT)
+        self._sections: Recent[tuple[Field, ...]] = Recent(_SECTIONS_KEPT)
         self._window: tuple[range, TextureWindow] | None = None
 
     def window(self, low_m: float, high_m: float) -> TextureWindow:
@@ -66,10 +66,14 @@ class Textures:
         wanted = range(int(np.floor(low_m / TEXEL_M / _SECTION)), int(np.floor(high_m / TEXEL_M / _SECTION)) + 1)
         if self._window is None or not (self._window[0].start <= wanted.start and wanted.stop <= self._window[0].stop):
             self._window = None  # frees the old one first
-            parts = [self._sections.get(k) for k in wanted]
+            parts = [self._sections.get(k, self._section) for k in wanted]
             levels = tuple(np.concatenate([part[level] for part in parts]) for level in range(LEVELS))
             self._window = (wanted, TextureWindow(wanted.start * _SECTION * TEXEL_M, levels))
         return self._window[1]
+
+    def _section(self, k: int) -> tuple[Field, ...]:
+        """Section k with its mip levels."""
+        return _mip_levels(self._make(k))
 
     def _make(self, k: int) -> Field:
         """Texels (_SECTION, columns, 8) of section k."""
@@ -80,7 +84,7 @@ class Textures:
         surface, deep = self._vessels(k, first, rows)
         tissue, blood = 0.13 * mid + 0.045 * fine, look.vessel_density * (surface + deep)
         if look.villi:
-            tissue += 0.16 * np.tanh(-grain)
+            tissue += 0.10 * np.tanh(-grain)
             relief_mm = look.relief_mm[0] * np.tanh(1.5 * grain) + look.relief_mm[1] * mid
         else:
             share = 0.02 if self._organ.folds == "haustral" else 0.05
