@@ -6,12 +6,16 @@
 
 from fusion.compare import Comparison, compare, compare_paths, format_table
 from fusion.config import RefineConfig, config_from_dict, load_config
+from fusion.lesions import Lesion, LesionTable, Sighting, locate, read_lesions, read_sightings, write_lesions
 from fusion.refine import refine
 from fusion.result import ImuConclusion, Refinement, ScaleConclusion
 from fusion.run_folder import Provenance, Run, read_run, write_run
+from fusion.run_states import read_refinement
 from fusion.summary import summarize
 
 __all__ = [
-    "Comparison", "ImuConclusion", "Provenance", "RefineConfig", "Refinement", "Run", "ScaleConclusion", "compare",
-    "compare_paths", "config_from_dict", "format_table", "load_config", "read_run", "refine", "summarize", "write_run",
+    "Comparison", "ImuConclusion", "Lesion", "LesionTable", "Provenance", "RefineConfig", "Refinement", "Run",
+    "ScaleConclusion", "Sighting", "compare", "compare_paths", "config_from_dict", "format_table", "load_config",
+    "locate", "read_lesions", "read_refinement", "read_run", "read_sightings", "refine", "summarize", "write_lesions",
+    "write_run",
 ]

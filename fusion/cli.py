@@ -1,4 +1,5 @@
-"""The command line: `capsule-vio demo | doctor | simulate | convert | inspect | predict | refine | compare`.
+"""The command line: `capsule-vio demo | doctor | simulate | convert | inspect | predict | refine | compare |
+locate | report`.
 
 Exit codes: 0 done; 2 wrong usage; 3 the input cannot be used; 4 no estimator produced a trajectory;
 1 a bug (traceback). Heavy libraries load only in the command that needs them.
@@ -24,7 +25,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     arguments = build_parser().parse_args(argv)
     commands: dict[str, Callable[[argparse.Namespace], int]] = {
         "demo": _demo, "doctor": _doctor, "simulate": _simulate, "convert": _convert, "inspect": _inspect,
-        "predict": _predict, "refine": _refine, "compare": _compare,
+        "predict": _predict, "refine": _refine, "compare": _compare, "locate": _locate,
+        "report": _report,
     }
     try:
         return commands[arguments.command](arguments)
@@ -248,6 +250,38 @@ def _compare(arguments: argparse.Namespace) -> int:
         _print_json(comparison.to_dict())
     else:
         print(format_table(comparison))
+    return 0
+
+
+def _locate(arguments: argparse.Namespace) -> int:
+    from fusion.lesions import locate, write_lesions
+    from fusion.lesions.text import format_lesions
+    from vio.formats import open_recording
+
+    recording = None if arguments.recording is None else open_recording(arguments.recording)
+    table = locate(arguments.run, arguments.lesions, depth=arguments.depth, recording=recording,
+                   between=None if arguments.between is None else (arguments.between[0], arguments.between[1]),
+                   video=arguments.video, depth_relative_sd=arguments.depth_sd)
+    out = arguments.run if arguments.out is None else arguments.out
+    paths = write_lesions(table, out)
+    if arguments.json:
+        _print_json(table.to_dict())
+    else:
+        print(format_lesions(table))
+        print("\n".join(str(path) for path in paths))
+        print(f"in pictures: capsule-vio report {arguments.run}" if out == arguments.run else "")
+    return 0
+
+
+def _report(arguments: argparse.Namespace) -> int:
+    from fusion.lesions import read_lesions
+    from fusion.report import write_report
+    from fusion.run_folder import read_run
+    from fusion.run_states import read_refinement
+
+    refinement, summary = read_refinement(arguments.run), read_run(arguments.run).summary
+    write_report(refinement, summary, arguments.run / "report.html", lesions=read_lesions(arguments.run))
+    print(arguments.run / "report.html")
     return 0
 
 

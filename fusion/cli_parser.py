@@ -25,7 +25,8 @@ def build_parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("--version", action="version", version=f"%(prog)s {_version()}")
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
-    for add in (_demo, _doctor, _simulate, _convert, _inspect, _predict, _refine, _compare):
+    for add in (_demo, _doctor, _simulate, _convert, _inspect, _predict, _refine, _compare, _locate,
+                _report):
         add(commands)
     return parser
 
@@ -140,3 +141,27 @@ def _compare(commands: Commands) -> None:
     parser.add_argument("runs", type=Path, nargs="+", metavar="RUN", help="run folder or TUM file")
     parser.add_argument("--truth", type=Path, metavar="traj.tum", help="default: the truth a run folder holds")
     _json(parser)
+
+
+def _locate(commands: Commands) -> None:
+    parser = _command(commands, "locate", "place lesions along the gut: how far, from which landmark, how sure",
+                      "locate RUN --lesions lesions.csv --depth DEPTH")
+    parser.add_argument("run", type=Path, metavar="RUN", help="run folder that refine wrote")
+    parser.add_argument("--lesions", type=Path, required=True, metavar="L.csv",
+                        help="columns label and frame or timestamp_s, optionally u, v, kind (finding, landmark), id; "
+                             "or Kvasir-Capsule's metadata.csv")
+    parser.add_argument("--depth", type=Path, metavar="DIR", help="depth maps that predict --depth wrote")
+    parser.add_argument("--recording", type=Path, metavar="REC", help="the recording: its own depth maps")
+    parser.add_argument("--between", nargs=2, metavar="LABEL", help="landmarks that percentages refer to (default: "
+                        "pylorus and ileocecal valve; without either, the first and the last landmark)")
+    parser.add_argument("--depth-sd", type=float, default=0.1, metavar="SHARE",
+                        help="standard deviation of a depth as a share of it (default: 0.1)")
+    parser.add_argument("--video", metavar="ID", help="which video_id of a Kvasir-Capsule file")
+    parser.add_argument("--out", type=Path, metavar="DIR", help="where lesions.csv and lesions.json go (default: RUN)")
+    _json(parser)
+
+
+def _report(commands: Commands) -> None:
+    parser = _command(commands, "report", "write a run's report.html again, with the lesions that locate placed",
+                      "report RUN")
+    parser.add_argument("run", type=Path, metavar="RUN", help="run folder that refine wrote")

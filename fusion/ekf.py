@@ -5,6 +5,8 @@ a clone of the previous pose (rotation, position). The nominal state lives outsi
 IMU steps → predict → update with the measured motion → fold the error into the nominal state → reset.
 The rotation error is in the world frame: R = Exp(theta) R_hat.
 
+Beside the filter, a bundle of sampled errors goes through the same steps: how the errors of all poses hang together.
+
 Outliers inflate R and are never refused outright: a hard gate that once loses track refuses everything
 after. Scale is not estimated: an EKF's free scale is biased and overconfident.
 """
@@ -17,6 +19,7 @@ from numpy.typing import NDArray
 
 from fusion.config import InitialConfig
 from fusion.estimate import Estimate, add_scale_uncertainty
+from fusion.joint import SAMPLES, SEED, JointSamples, checkpoints, square_root, with_assumed_scale
 from fusion.problem import Problem
 from fusion.result import ScaleConclusion
 from vio import se3
@@ -51,6 +54,8 @@ class _CapsuleEkf:
         P[VEL], P[BG], P[BA] = (initial.velocity_sd_m_s**2, initial.gyro_bias_sd_rad_s**2,
                                 initial.accel_bias_sd_m_s2**2)
         self.filter.P = np.diag(P)
+        self.rng = np.random.default_rng(SEED)
+        self.errors = self.rng.standard_normal((SAMPLES, DIM)) * np.sqrt(P)
 
     def predict(self, k: int) -> None:
         """Clone the pose, then carry state and covariance over interval k."""
@@ -66,6 +71,9 @@ class _CapsuleEkf:
         F[:15, :15], full_Q[:15, :15] = Phi, Q
         self.filter.F, self.filter.Q = F @ clone, full_Q
         self.filter.predict()
+        drawn = self.rng.standard_normal((SAMPLES, 15)) @ square_root(Q).T
+        self.errors = self.errors @ self.filter.F.T
+        self.errors[:, :15] += drawn
 
     def _integrate(self, k: int) -> tuple[Array, Array]:
         pieces, noise = self.problem.pieces, self.problem.noise
@@ -108,6 +116,8 @@ class _CapsuleEkf:
         squared = float(z @ np.linalg.solve(S, z))
         noise = noise * max(1.0, squared / CHI2_6_99) ** 2  # soften, never refuse
         self.filter.update(z, lambda x: H, lambda x: H @ x, R=noise)
+        drawn = self.rng.standard_normal((SAMPLES, 6)) @ square_root(noise).T
+        self.errors -= (self.errors @ H.T + drawn) @ self.filter.K.T
         self._fold()
         return squared > CHI2_6_999
 
@@ -149,6 +159,10 @@ class _CapsuleEkf:
         cov: Array = turn @ self.filter.P @ turn.T
         return cov
 
+    def pose_errors(self) -> Array:
+        """(S, 6) sampled errors in the terms of `pose_cov`."""
+        return np.concatenate([self.errors[:, ROT] @ self.R, self.errors[:, POS] @ self.R], axis=1)
+
 
 def ekf_estimate(problem: Problem, R_world_body_first: Array, initial: InitialConfig) -> Estimate:
     """Filter a whole recording; only motions between neighbouring frames are used.
@@ -169,6 +183,8 @@ def ekf_estimate(problem: Problem, R_world_body_first: Array, initial: InitialCo
     m = len(problem)
     T, cov, v = np.tile(np.eye(4), (m, 1, 1)), np.zeros((m, 6, 6)), np.zeros((m, 3))
     gyro_bias, accel_bias, outliers = np.zeros((m, 3)), np.zeros((m, 3)), []
+    node = checkpoints(m)
+    kept, sampled = set(node.tolist()), []
     for k in range(m):
         if k > 0:
             ekf.predict(k - 1)
@@ -176,6 +192,8 @@ def ekf_estimate(problem: Problem, R_world_body_first: Array, initial: InitialCo
                 outliers.append(int(motion_of[k - 1]))
         T[k, :3, :3], T[k, :3, 3], v[k] = ekf.R, ekf.p, ekf.v
         cov[k], gyro_bias[k], accel_bias[k] = ekf.pose_cov(), ekf.gyro_bias, ekf.accel_bias
+        if k in kept:
+            sampled.append(ekf.pose_errors())
     if not np.isfinite(T).all():
         raise EstimationError("ekf: the trajectory is not finite")
     if len(outliers) > LOST_SHARE * updates:
@@ -185,5 +203,7 @@ def ekf_estimate(problem: Problem, R_world_body_first: Array, initial: InitialCo
     reason = "the filter holds scale at its prior: a filter's free scale is biased"
     conclusion = ScaleConclusion("fixed", mean, sd, reason)
     cov = add_scale_uncertainty(T, cov, sd, problem.motions.T_body_camera)
+    joint = JointSamples(node, np.stack(sampled, axis=1), np.zeros((SAMPLES, len(node))))
+    joint = with_assumed_scale(joint, T, sd, problem.motions.T_body_camera, ekf.rng)
     return Estimate(T, cov, v, gyro_bias, accel_bias, np.full(m, mean), np.full(m, sd), conclusion,
-                    np.array(outliers, np.int64))
+                    np.array(outliers, np.int64), joint=joint)

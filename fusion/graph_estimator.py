@@ -15,6 +15,8 @@ from fusion.covariance import marginal_covariances
 from fusion.estimate import Estimate, add_scale_uncertainty
 from fusion.graph import add_anchor, add_imu, add_scale_walk, read_log_scales, read_states
 from fusion.initialization import Start, chunked_start, search_log_scale
+from fusion.joint import SEED, with_assumed_scale
+from fusion.joint_graph import sample_graph
 from fusion.problem import Problem
 from fusion.result import ScaleConclusion, ScalePolicy
 from fusion.scale import FreePass, Segments
@@ -183,6 +185,8 @@ class GraphEstimator:
         estimated = final.term.segment is not None
         gaussian = linear_graph(final.native, final.solution.values, final.term)
         cov, variance = marginal_covariances(gaussian, m, segments if estimated else 0)
+        rng = np.random.default_rng(SEED)
+        joint = sample_graph(gaussian, m, self.segments.of_node if estimated else None, rng)
         states = read_states(final.solution.values, 0, m)
         T = states.T_world_body
         if estimated:
@@ -191,6 +195,8 @@ class GraphEstimator:
             log_scale_sd = np.sqrt(variance)[of_node]
         else:
             log_scale, log_scale_sd = np.full(m, conclusion.log_mean), np.full(m, conclusion.log_sd)
-            cov = add_scale_uncertainty(T, cov, conclusion.log_sd, self.problem.motions.T_body_camera)
+            T_body_camera = self.problem.motions.T_body_camera
+            cov = add_scale_uncertainty(T, cov, conclusion.log_sd, T_body_camera)
+            joint = None if joint is None else with_assumed_scale(joint, T, conclusion.log_sd, T_body_camera, rng)
         return Estimate(T, cov, states.v, states.gyro_bias, states.accel_bias, log_scale, log_scale_sd, conclusion,
-                        final.rejected, fixed_chi2, inflation)
+                        final.rejected, fixed_chi2, inflation, joint)

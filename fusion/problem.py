@@ -32,6 +32,8 @@ class Problem:
     name: str
     t_s: Array
     """(M,) node times."""
+    first_frame: int
+    """Number of node 0's frame in the recording."""
     pieces: ImuPieces
     """IMU of the M-1 intervals."""
     imu_usable: NDArray[np.bool_]
@@ -79,7 +81,7 @@ def build_problem(recording: Recording, motions: RelativeMotions) -> Problem:
     clipped = _saturation_inflation(recording, t)
     accel_inflation, gyro_inflation = vibration_inflation(recording.imu, imu_t, t, noise)
     return Problem(
-        name=recording.name, t_s=t, pieces=pieces, imu_usable=usable, gaps=gaps,
+        name=recording.name, t_s=t, first_frame=lo, pieces=pieces, imu_usable=usable, gaps=gaps,
         accel_inflation=holes * clipped[1] * accel_inflation, gyro_inflation=holes * clipped[0] * gyro_inflation,
         motions=batch,
         scale_log_mean=motions.scale_log_mean, scale_log_sd=motions.scale_log_sd, noise=noise,

@@ -15,7 +15,7 @@ from fusion.estimate import Estimate, motions_estimate
 from fusion.graph_estimator import GraphEstimator
 from fusion.initialization import level_rotation
 from fusion.problem import Problem, build_problem
-from fusion.result import Estimator, ImuConclusion, Refinement
+from fusion.result import Estimator, ImuConclusion, Refinement, View
 from fusion.stages import Stages
 from vio import se3
 from vio.errors import EstimationError
@@ -106,7 +106,9 @@ def _conclude(recording: Recording, motions: RelativeMotions, problem: Problem, 
         imu=ImuConclusion(estimate.imu_chi2_per_dof, estimate.imu_inflation, problem.gaps),
         motions_used=len(motions) - len(estimate.rejected), rejected=estimate.rejected, bridged=bridged,
         time_offset_s=recording.calibration.time_offset_s, truth=_truth(recording, times),
-        timing_s=dict(stages.seconds), peak_rss_bytes=_peak_rss_bytes(),
+        timing_s=dict(stages.seconds), peak_rss_bytes=_peak_rss_bytes(), joint=estimate.joint,
+        view=View(problem.first_frame, problem.motions.T_body_camera, recording.calibration.camera,
+                  motions.scale_log_mean),
     )
 
 

@@ -8,6 +8,8 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from fusion.joint import JointSamples
+from vio.camera import Camera
 from vio.imu import Gap
 from vio.trajectory import Trajectory
 
@@ -38,6 +40,20 @@ class ImuConclusion:
     """Factor on the accelerometer density that the scale policy asked for; 1 = as calibrated."""
     gaps: tuple[Gap, ...]
     """Holes over 0.5 s; their frame intervals carry no inertial factor."""
+
+
+@dataclass(frozen=True)
+class View:
+    """What it takes to lay a pixel of a frame into the world."""
+
+    first_frame: int
+    """Number in the recording of the trajectory's first frame."""
+    T_body_camera: Array
+    """(4, 4) pose of the camera in the body."""
+    camera: Camera | None
+    """None when the recording has no calibrated camera."""
+    prior_log_scale: float
+    """ln(metres per motion unit) that the source of the motions declared; predicted depth is metric at it."""
 
 
 @dataclass(frozen=True)
@@ -76,3 +92,7 @@ class Refinement:
     """Truth at the frames it covers, when the recording has any."""
     timing_s: dict[str, float] = field(default_factory=dict)
     peak_rss_bytes: int = 0
+    joint: JointSamples | None = None
+    """How the errors of all poses hang together; None where that could not be sampled."""
+    view: View | None = None
+    """How the frames looked at the world; None when unknown."""

@@ -51,6 +51,10 @@ class TrackingError(VioError):
     """Images or tracks from which no motion can be measured."""
 
 
+class LesionError(VioError):
+    """A list of lesions that cannot be placed on a trajectory."""
+
+
 class CorruptionError(VioError):
     """A corruption or sensor fault that does not exist, or that the data at hand cannot suffer."""
 

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusion.result import Refinement
+from vio import se3
 from vio.alignment import Mode, align, associate
 from vio.consistency import fix_gauge
 from vio.errors import DegenerateAlignmentError
@@ -55,6 +56,8 @@ class Scene:
     errors: TruthErrors | None
     rejected_frames: NDArray[np.int64] | None
     """Frames that rejected motions start from; None when the refinement alone cannot tell."""
+    T_scene_world: Array
+    """(4, 4) from the estimator's world to the frame of the pictures."""
 
 
 def make_scene(refinement: Refinement, motions: RelativeMotions | None = None) -> Scene:
@@ -69,8 +72,9 @@ def make_scene(refinement: Refinement, motions: RelativeMotions | None = None) -
     if truth is not None:
         mode, refined, only = _align_both(refined, only, truth)
         errors = _errors(mode, refinement.trajectory, refined, only, truth)
+    T_scene_world = refined.T_world_body[0] @ se3.inverse(refinement.trajectory.T_world_body[0])
     return Scene(refined.t_s, refined.positions_m, only.positions_m, _claimed_sd(refinement.trajectory), errors,
-                 _rejected_frames(refinement, motions))
+                 _rejected_frames(refinement, motions), T_scene_world)
 
 
 def _align_both(refined: Trajectory, only: Trajectory, truth: Trajectory) -> tuple[Mode, Trajectory, Trajectory]:

@@ -29,21 +29,26 @@ def unit_of(*metres: Array) -> tuple[str, float]:
     return ("m", 1.0) if largest > 2 else ("mm", 1e3)
 
 
+def space_unit(scene: Scene) -> tuple[str, float]:
+    """Name and factor of the unit of the picture in space."""
+    centre = scene.refined_m.mean(axis=0)
+    return unit_of(scene.refined_m - centre, scene.motions_m - centre)
+
+
 def trajectory_figure(scene: Scene) -> Figure:
     """Refined, motions alone and truth in space, equal scale on all axes."""
     truth = None if scene.errors is None else scene.errors.truth_m
-    centre = scene.refined_m.mean(axis=0)
-    unit, factor = unit_of(scene.refined_m - centre, scene.motions_m - centre)
+    unit, factor = space_unit(scene)
     data = []
     if truth is not None and scene.errors is not None:
         data.append(_line3(truth, scene.errors.t_s, "truth", "--truth", 3, unit, factor))
     data.append(_line3(scene.motions_m, scene.t_s, "motions alone", "--motions", 3, unit, factor))
     data.append(_line3(scene.refined_m, scene.t_s, "refined", "--refined", 5, unit, factor))
-    data.append(_points3(scene.refined_m[:1], "start", "circle", "--refined", 6, factor))
-    data.append(_points3(scene.refined_m[-1:], "end", "diamond", "--refined", 6, factor))
+    data.append(points3(scene.refined_m[:1], "start", "circle", "--refined", 6, factor))
+    data.append(points3(scene.refined_m[-1:], "end", "diamond", "--refined", 6, factor))
     if scene.rejected_frames is not None and len(scene.rejected_frames):
         at = scene.rejected_frames[_every(len(scene.rejected_frames))]
-        data.append(_points3(scene.refined_m[at], "motion rejected", "square", "--rejected", 3, factor))
+        data.append(points3(scene.refined_m[at], "motion rejected", "square", "--rejected", 3, factor))
     axes = {f"{axis}axis": {"title": {"text": f"{axis} [{unit}]"}, "backgroundcolor": "--panel", "gridcolor": "--grid",
                             "zerolinecolor": "--grid", "color": "--muted", "showspikes": False}
             for axis in "xyz"}
@@ -57,11 +62,11 @@ def trajectory_figure(scene: Scene) -> Figure:
 def error_figure(errors: TruthErrors, rejected_t_s: Array | None, gaps: Sequence[tuple[float, float]]) -> Figure:
     """Distance from truth along time, both estimates under the same alignment."""
     unit, factor = unit_of(errors.refined_m, errors.motions_m)
-    data = [_line(errors.t_s, errors.motions_m * factor, "motions alone", "--motions", 1.6),
-            _line(errors.t_s, errors.refined_m * factor, "refined", "--refined", 2.2)]
+    data = [line(errors.t_s, errors.motions_m * factor, "motions alone", "--motions", 1.6),
+            line(errors.t_s, errors.refined_m * factor, "refined", "--refined", 2.2)]
     if rejected_t_s is not None and len(rejected_t_s):
         data.append(_ticks(rejected_t_s))
-    return {"data": data, "layout": _time_layout(f"error [{unit}]", errors.t_s, gaps, zero=True)}
+    return {"data": data, "layout": time_layout(f"error [{unit}]", errors.t_s, gaps, zero=True)}
 
 
 def claim_figure(scene: Scene, gaps: Sequence[tuple[float, float]]) -> Figure | None:
@@ -71,11 +76,11 @@ def claim_figure(scene: Scene, gaps: Sequence[tuple[float, float]]) -> Figure | 
     claim = 3 * scene.claimed_sd_m
     against = [] if scene.errors is None else [scene.errors.first_pose_m]
     unit, factor = unit_of(claim, *against)
-    data = [_line(scene.t_s, claim * factor, "claimed 3 sigma", "--refined", 1) | {
+    data = [line(scene.t_s, claim * factor, "claimed 3 sigma", "--refined", 1) | {
         "fill": "tozeroy", "fillcolor": "--refined-band", "line": {"color": "--refined", "width": 1, "dash": "dot"}}]
     if scene.errors is not None:
-        data.append(_line(scene.errors.t_s, scene.errors.first_pose_m * factor, "refined", "--refined", 2.2))
-    return {"data": data, "layout": _time_layout(f"position [{unit}]", scene.t_s, gaps, zero=True)}
+        data.append(line(scene.errors.t_s, scene.errors.first_pose_m * factor, "refined", "--refined", 2.2))
+    return {"data": data, "layout": time_layout(f"position [{unit}]", scene.t_s, gaps, zero=True)}
 
 
 def scale_figure(refinement: Refinement, gaps: Sequence[tuple[float, float]]) -> Figure:
@@ -84,17 +89,17 @@ def scale_figure(refinement: Refinement, gaps: Sequence[tuple[float, float]]) ->
     unit, factor = unit_of(np.exp(s))
     keep = thin(s, LIMIT)
     t, low, middle, high = t[keep], *(factor * np.exp(s[keep] + k * sd[keep]) for k in (-2, 0, 2))
-    band = {"x": _numbers(np.concatenate([t, t[::-1]])), "y": _numbers(np.concatenate([high, low[::-1]])),
+    band = {"x": numbers(np.concatenate([t, t[::-1]])), "y": numbers(np.concatenate([high, low[::-1]])),
             "type": "scatter", "mode": "lines", "fill": "toself", "fillcolor": "--refined-band", "name": "± 2 sd",
             "line": {"width": 0}, "hoverinfo": "skip"}
-    data = [band, _line(t, middle, "scale", "--refined", 2.2)]
-    return {"data": data, "layout": _time_layout(f"{unit} per motion unit", t, gaps)}
+    data = [band, line(t, middle, "scale", "--refined", 2.2)]
+    return {"data": data, "layout": time_layout(f"{unit} per motion unit", t, gaps)}
 
 
 def bias_figure(t_s: Array, bias: Array, label: str, gaps: Sequence[tuple[float, float]]) -> Figure:
     """Three components of a bias along time."""
-    data = [_line(t_s, bias[:, k], name, colour, 1.8) for k, (name, colour) in enumerate(AXIS_COLOURS)]
-    return {"data": data, "layout": _time_layout(label, t_s, gaps, height=240)}
+    data = [line(t_s, bias[:, k], name, colour, 1.8) for k, (name, colour) in enumerate(AXIS_COLOURS)]
+    return {"data": data, "layout": time_layout(label, t_s, gaps, height=240)}
 
 
 def _layout(height: int) -> Figure:
@@ -109,9 +114,10 @@ def _layout(height: int) -> Figure:
     }
 
 
-def _time_layout(
+def time_layout(
     label: str, t_s: Array, gaps: Sequence[tuple[float, float]], zero: bool = False, height: int = 290
 ) -> Figure:
+    """Layout of a figure over time, with holes in the inertial data shaded."""
     axis = {"gridcolor": "--grid", "zeroline": False, "linecolor": "--grid", "ticks": "outside", "tickcolor": "--grid",
             "automargin": True}
     shapes = [{"type": "rect", "xref": "x", "yref": "paper", "x0": start, "x1": end, "y0": 0, "y1": 1,
@@ -125,15 +131,16 @@ def _time_layout(
     }
 
 
-def _line(t_s: Array, values: Array, name: str, colour: str, width: float) -> Figure:
+def line(t_s: Array, values: Array, name: str, colour: str, width: float) -> Figure:
+    """A curve over time, thinned for the eye."""
     keep = thin(values, LIMIT)
-    return {"type": "scatter", "mode": "lines", "name": name, "x": _numbers(t_s[keep]), "y": _numbers(values[keep]),
+    return {"type": "scatter", "mode": "lines", "name": name, "x": numbers(t_s[keep]), "y": numbers(values[keep]),
             "line": {"color": colour, "width": width}}
 
 
 def _ticks(t_s: Array) -> Figure:
     at = t_s[_every(len(t_s))]
-    return {"type": "scatter", "mode": "markers", "name": "motion rejected", "x": _numbers(at), "y": [0] * len(at),
+    return {"type": "scatter", "mode": "markers", "name": "motion rejected", "x": numbers(at), "y": [0] * len(at),
             "hoverinfo": "skip", "cliponaxis": False,
             "marker": {"symbol": "line-ns-open", "size": 9, "color": "--rejected", "line": {"width": 1.5}}}
 
@@ -142,17 +149,18 @@ def _line3(points_m: Array, t_s: Array, name: str, colour: str, width: float, un
     keep = _every(len(points_m))
     hover = f"{name}<br>%{{customdata:.2f}} s<br>%{{x:.4g}}, %{{y:.4g}}, %{{z:.4g}} {unit}<extra></extra>"
     return _xyz(points_m[keep], factor) | {
-        "mode": "lines", "name": name, "customdata": _numbers(t_s[keep]), "hovertemplate": hover,
+        "mode": "lines", "name": name, "customdata": numbers(t_s[keep]), "hovertemplate": hover,
         "line": {"color": colour, "width": width}}
 
 
-def _points3(points_m: Array, name: str, symbol: str, colour: str, size: float, factor: float) -> Figure:
+def points3(points_m: Array, name: str, symbol: str, colour: str, size: float, factor: float) -> Figure:
+    """Marks in space."""
     return _xyz(points_m, factor) | {"mode": "markers", "name": name, "hoverinfo": "name",
                                      "marker": {"symbol": symbol, "size": size, "color": colour}}
 
 
 def _xyz(points_m: Array, factor: float) -> Figure:
-    return {"type": "scatter3d"} | {axis: _numbers(points_m[:, k] * factor) for k, axis in enumerate("xyz")}
+    return {"type": "scatter3d"} | {axis: numbers(points_m[:, k] * factor) for k, axis in enumerate("xyz")}
 
 
 def _every(n: int) -> NDArray[np.int64]:
@@ -160,6 +168,6 @@ def _every(n: int) -> NDArray[np.int64]:
     return np.unique(np.linspace(0, n - 1, min(n, LIMIT)).round().astype(np.int64))
 
 
-def _numbers(values: Array) -> list[float | None]:
+def numbers(values: Array) -> list[float | None]:
     """JSON numbers with six significant digits; null where not finite."""
     return [float(f"{value:.6g}") if np.isfinite(value) else None for value in values.tolist()]

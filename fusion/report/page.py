@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from html import escape
 from importlib.resources import files
 from pathlib import Path
@@ -13,6 +13,7 @@ from typing import Any
 from fusion.report import figures, words
 from fusion.report.aligned import Scene, make_scene
 from fusion.report.plot import trajectory_svg
+from fusion.report.unrolled import lesion_table, space_marks, unrolled_figure
 from fusion.result import Refinement
 from vio.alignment import MODES
 from vio.atomic import atomic_write
@@ -23,11 +24,15 @@ PAPER_METRICS = {
     "ate_paper": "mean step error [mm]", "abs_diff_t": "AbsDiff translation [mm]", "abs_rel_t": "AbsRel translation",
     "are_paper": "mean step rotation error [°]", "abs_diff_r": "AbsDiff rotation [°]", "abs_rel_r": "AbsRel rotation",
 }
+UNROLLED = ("Distance along the travelled centreline from the first frame; back-and-forth and dwell do not count. "
+            "Bars are 95 % intervals, dotted lines are landmarks. A lesion stands off the course by as far as the "
+            "camera saw ahead.")
 PAPER_FACTORS = {"ate_paper": 1e3, "abs_diff_t": 1e3, "are_paper": 57.29577951308232, "abs_diff_r": 57.29577951308232}
 
 
 def write_report(
-    refinement: Refinement, summary: Mapping[str, Any], path: str | Path, motions: RelativeMotions | None = None
+    refinement: Refinement, summary: Mapping[str, Any], path: str | Path, motions: RelativeMotions | None = None,
+    lesions: Sequence[Mapping[str, Any]] | None = None,
 ) -> None:
     """Write the page, atomically.
 
@@ -36,6 +41,7 @@ def write_report(
         summary: as in `summary.json` (docs/conventions.md); figures of accuracy are taken from here.
         path: the file.
         motions: the motions it was made from; they place the rejected ones where pairs are not all neighbours.
+        lesions: rows of `lesions.json` (`fusion.read_lesions`).
 
     Raises:
         OutputError: the file cannot be written.
@@ -43,7 +49,7 @@ def write_report(
     from plotly.offline import get_plotlyjs  # heavy, and needed only once a page is written
 
     page = Template(_asset("page.html")).substitute(
-        _content(refinement, summary, make_scene(refinement, motions)),
+        _content(refinement, summary, make_scene(refinement, motions), lesions or ()),
         style=_asset("page.css"), script=_asset("page.js"), plotly=get_plotlyjs(),
     )
     with atomic_write(path) as file:
@@ -54,11 +60,12 @@ def _asset(name: str) -> str:
     return files(__package__).joinpath(name).read_text(encoding="utf-8")
 
 
-def _content(refinement: Refinement, summary: Mapping[str, Any], scene: Scene) -> dict[str, str]:
+def _content(refinement: Refinement, summary: Mapping[str, Any], scene: Scene,
+             lesions: Sequence[Mapping[str, Any]]) -> dict[str, str]:
     verdict = words.verdict(refinement, summary)
     within = None if scene.errors is None else scene.errors.within_3_sigma
     facts = words.sentences(refinement, summary, within)
-    drawn = _figures(refinement, scene)
+    drawn = _figures(refinement, scene, lesions)
     return {
         "name": escape(refinement.name),
         "facts_line": escape(_facts_line(refinement, summary)),
@@ -66,6 +73,7 @@ def _content(refinement: Refinement, summary: Mapping[str, Any], scene: Scene) -
         "verdict": escape(verdict.text),
         "tiles": _tiles(refinement, summary, scene),
         "sentences": "".join(f"<dt>{escape(head)}</dt><dd>{escape(text)}</dd>" for head, text in facts),
+        "lesions": lesion_table(lesions) if lesions else "",
         "still": trajectory_svg(refinement, scene),
         "sections": "".join(_section(key, title, caption) for key, title, caption, _ in drawn),
         "accuracy": _accuracy(summary.get("accuracy") or {}),
@@ -75,12 +83,17 @@ def _content(refinement: Refinement, summary: Mapping[str, Any], scene: Scene) -
     }
 
 
-def _figures(refinement: Refinement, scene: Scene) -> list[tuple[str, str, str, figures.Figure]]:
+def _figures(refinement: Refinement, scene: Scene,
+             lesions: Sequence[Mapping[str, Any]]) -> list[tuple[str, str, str, figures.Figure]]:
     """(key, title, caption, figure) in reading order."""
     gaps = [(gap.start_s, gap.end_s) for gap in refinement.imu.gaps]
     t = refinement.trajectory.t_s
     rejected = None if scene.rejected_frames is None else t[scene.rejected_frames]
-    out = [("trajectory", "Trajectory", _trajectory_caption(refinement, scene), figures.trajectory_figure(scene))]
+    space = figures.trajectory_figure(scene)
+    out = [("trajectory", "Trajectory", _trajectory_caption(refinement, scene), space)]
+    if lesions:
+        space["data"] += space_marks(lesions, scene.T_scene_world, figures.space_unit(scene)[1])
+        out.append(("unrolled", "The gut unrolled", UNROLLED, unrolled_figure(refinement, lesions)))
     if scene.errors is not None:
         caption = f"Both estimates {words.SHORT_MODES[scene.errors.mode]}. {_marks(refinement, rejected is not None)}"
         out.append(("error", "Distance from truth", caption, figures.error_figure(scene.errors, rejected, gaps)))

@@ -2,16 +2,26 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 
-from fusion import RefineConfig, Refinement, refine
+from benchmarks.simulated_lesions import (
+    SimulatedLesion,
+    draw_lesions,
+    network_depths,
+    sightings_of,
+    true_lumen,
+    write_depth,
+)
+from fusion import RefineConfig, Refinement, Sighting, locate, refine
 from vio.imu import ImuNoise, ImuSamples
 from vio.motions import RelativeMotions
 from vio.recording import Recording
 from vio.simulation import T_BODY_CAMERA, NetworkMotions, Simulation, network_like_motions, simulate
 
+DEPTH_SD = 0.10
 NOISELESS = {"noise": ImuNoise(1e-12, 1e-12, 1e-12, 1e-12), "accel_bias_sd_m_s2": 0.0, "gyro_bias_sd_rad_s": 0.0}
 
 
@@ -88,3 +98,41 @@ def short() -> Examination:
 def configured() -> Callable[..., RefineConfig]:
     """A configuration with some of its top-level fields replaced."""
     return lambda **changes: replace(RefineConfig(), **changes)
+
+
+@dataclass(frozen=True)
+class LesionCase:
+    """A simulated recording whose lesions are known, with the depth a network would report at them."""
+
+    recording: Recording
+    refined: Refinement
+    lesions: list[SimulatedLesion]
+    groups: list[list[SimulatedLesion]]
+    depth: Path
+
+    def rows(self, merged: bool = True, labels: dict[int, str] | None = None) -> list[Sighting]:
+        """Sightings of all lesions; those with a label of their own are landmarks."""
+        named = labels or {}
+        found = []
+        for k, group in enumerate(self.groups):
+            for seen in group if merged else [s for s in group if s.frame == self.lesions[k].frame]:
+                found.append(Sighting(named.get(k, f"lesion {k}"), "landmark" if k in named else "finding", seen.frame,
+                                      None, seen.pixel, "list", id=str(k)))
+        return found
+
+    def locate(self, **options: object) -> dict[str, object]:
+        rows = self.rows(options.pop("merged", True), options.pop("labels", None))
+        table = locate(self.refined, rows, depth=self.depth, recording=self.recording, **options)
+        return {lesion.id: lesion for lesion in table.lesions}
+
+
+@pytest.fixture(scope="session")
+def case(examine: Callable, tmp_path_factory: pytest.TempPathFactory) -> LesionCase:
+    """Small bowel, 10 lesions, each seen by up to five frames."""
+    made = examine("small-bowel", "peristalsis", 2, 150.0, 41, driving="operated")
+    rng = np.random.default_rng(41)
+    lesions = draw_lesions(made.simulation, true_lumen(made.simulation), 10, rng)
+    groups = [sightings_of(made.simulation, lesion, 2) for lesion in lesions]
+    folder = tmp_path_factory.mktemp("lesions") / "depth"
+    write_depth(folder, made.simulation, network_depths(made.simulation, made.network, groups, DEPTH_SD, rng))
+    return LesionCase(made.recording, refine(made.recording, made.motions), lesions, groups, folder)

@@ -186,18 +186,29 @@ def _read_depth(
     """Depth file of every frame (matched by equal stamps), metres per count, and how they are stored if not plainly."""
     if not (sensor / "data.csv").is_file():
         return (), 1e-3, None
-    name, data = short_name(sensor / "sensor.yaml"), load_yaml(sensor / "sensor.yaml")
-    encoding = depth_encoding_from_asl(data, name)
-    unit_m = number(data, "depth_unit_m", name) if encoding is None else 1e-3
-    if unit_m <= 0:
-        raise CalibrationError(f"{name}: depth_unit_m is {unit_m:g}, must be positive metres")
-    t_ns, files = _read_listing(sensor)
+    t_ns, files, unit_m, encoding = read_depth_listing(sensor)
     stray = ~np.isin(t_ns, frame_t_ns)
     if stray.any():
         raise FormatError(f"{short_name(sensor / 'data.csv')}: stamp {t_ns[np.argmax(stray)]} is no frame of cam0; "
                           "depth images carry the stamp of their frame")
     by_stamp = dict(zip(t_ns.tolist(), files, strict=True))
     return tuple(by_stamp.get(t) for t in frame_t_ns.tolist()), unit_m, encoding
+
+
+def read_depth_listing(
+    sensor: Path,
+) -> tuple[NDArray[np.int64], tuple[Path, ...], float, DepthEncoding | None]:
+    """Stamps (N,) and files of a folder laid out as `mav0/depth0`, metres per count, and the encoding if not plain.
+
+    Raises:
+        VioError: `data.csv` or `sensor.yaml` is missing or unusable, naming file and line.
+    """
+    name, data = short_name(sensor / "sensor.yaml"), load_yaml(sensor / "sensor.yaml")
+    encoding = depth_encoding_from_asl(data, name)
+    unit_m = number(data, "depth_unit_m", name) if encoding is None else 1e-3
+    if unit_m <= 0:
+        raise CalibrationError(f"{name}: depth_unit_m is {unit_m:g}, must be positive metres")
+    return *_read_listing(sensor), unit_m, encoding
 
 
 def _read_provenance(path: Path) -> dict[str, Any]:

@@ -1,0 +1,130 @@
+"""A run folder's states read back into a `Refinement`, and the optional keys of `trajectory.npz`."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fusion.joint import JointSamples
+from fusion.result import ImuConclusion, Refinement, ScaleConclusion, View
+from vio import se3
+from vio.camera import Camera
+from vio.errors import FormatError, VioError
+from vio.formats.tum import read_tum
+from vio.imu import Gap
+from vio.motions import UNREADABLE
+from vio.trajectory import Trajectory
+
+Array = NDArray[np.float64]
+
+SHAPES = {"velocity": (3,), "gyro_bias": (3,), "accel_bias": (3,), "log_scale": (), "log_scale_sd": ()}
+AGAIN = "refine the recording again"
+
+
+def joint_arrays(joint: JointSamples | None) -> dict[str, Any]:
+    """Joint samples as keys of `trajectory.npz`; single precision is far finer than what they speak of."""
+    if joint is None:
+        return {}
+    return {"joint_node": joint.node, "joint_xi": joint.xi.astype(np.float32),
+            "joint_log_scale": joint.log_scale.astype(np.float32)}
+
+
+def view_arrays(view: View | None) -> dict[str, Any]:
+    """How frames looked at the world, as keys of `trajectory.npz`."""
+    if view is None:
+        return {}
+    camera = None if view.camera is None else dataclasses.asdict(view.camera)
+    return {"first_frame": np.int64(view.first_frame), "T_body_camera": view.T_body_camera,
+            "prior_log_scale": np.float64(view.prior_log_scale), "camera": np.array(json.dumps(camera))}
+
+
+def read_refinement(folder: str | Path) -> Refinement:
+    """The refinement that a run folder holds. Runs of earlier versions come without joint samples and view.
+
+    Raises:
+        FormatError: a file is missing, damaged, or not what it claims.
+    """
+    from fusion.run_folder import read_run  # which imports this module
+
+    folder = Path(folder)
+    run = read_run(folder)
+    name = f"{run.name}/trajectory.npz"
+    arrays = _load(folder / "trajectory.npz", name)
+    try:
+        trajectory = Trajectory(arrays["t"], arrays["T_world_body"], arrays["cov"])
+        m = len(trajectory)
+        states = {key: _shaped(arrays[key], (m, *shape), key) for key, shape in SHAPES.items()}
+        joint, view = _joint(arrays, m), _view(arrays)
+    except KeyError as error:
+        raise FormatError(f"{name}: missing key {error}; {AGAIN}") from None
+    except (VioError, *UNREADABLE) as error:
+        reason = (str(error).splitlines() or [type(error).__name__])[0]
+        raise FormatError(f"{name}: {reason}; {AGAIN}") from None
+    return _refinement(folder, run.summary, run.motions_only, trajectory, states, arrays, joint, view)
+
+
+def _refinement(folder: Path, summary: dict[str, Any], motions_only: Trajectory, trajectory: Trajectory,
+                states: dict[str, Array], arrays: dict[str, Any], joint: JointSamples | None,
+                view: View | None) -> Refinement:
+    truth = folder / "truth.tum"
+    try:
+        imu, scale, motions = summary["imu"], summary["scale"], summary["motions"]
+        gaps = tuple(Gap(float(gap["start_s"]), float(gap["end_s"])) for gap in imu["gaps"])
+        return Refinement(
+            name=str(summary["name"]), estimator=summary["estimator"], fallback_reason=summary["fallback_reason"],
+            trajectory=trajectory, velocity_m_s=states["velocity"], gyro_bias_rad_s=states["gyro_bias"],
+            accel_bias_m_s2=states["accel_bias"], log_scale=states["log_scale"], log_scale_sd=states["log_scale_sd"],
+            motions_only=motions_only,
+            scale=ScaleConclusion(scale["policy"], float(scale["log_mean"]), float(scale["log_sd"]), scale["reason"]),
+            imu=ImuConclusion(imu["chi2_per_dof"], float(imu["inflation"]), gaps), motions_used=int(motions["used"]),
+            rejected=np.asarray(arrays["rejected"], np.int64), bridged=int(motions.get("bridged", 0)),
+            time_offset_s=float(summary["time_offset_s"]), truth=read_tum(truth) if truth.is_file() else None,
+            timing_s=dict(summary["timing_s"]), peak_rss_bytes=int(summary["peak_rss_bytes"]), joint=joint, view=view,
+        )
+    except KeyError as error:
+        raise FormatError(f"{folder.name}: summary.json or trajectory.npz lacks {error}; {AGAIN}") from None
+    except (TypeError, ValueError) as error:
+        raise FormatError(f"{folder.name}/summary.json: not as a run writes it ({error}); {AGAIN}") from None
+
+
+def _load(path: Path, name: str) -> dict[str, Any]:
+    try:
+        with path.open("rb") as file:
+            return dict(np.load(file, allow_pickle=False))
+    except FileNotFoundError:
+        raise FormatError(f"{name}: no such file; give a folder written by `capsule-vio refine`") from None
+    except (OSError, *UNREADABLE) as error:
+        reason = (str(error).splitlines() or [type(error).__name__])[0]
+        raise FormatError(f"{name}: not a readable npz without pickles ({reason}); {AGAIN}") from None
+
+
+def _joint(arrays: dict[str, Any], m: int) -> JointSamples | None:
+    if "joint_xi" not in arrays:
+        return None
+    node = np.asarray(arrays["joint_node"], np.int64)
+    xi, log_scale = np.asarray(arrays["joint_xi"], float), np.asarray(arrays["joint_log_scale"], float)
+    k = len(node)
+    if k == 0 or node[0] != 0 or node[-1] != m - 1 or (np.diff(node) <= 0).any():
+        raise ValueError("joint_node does not run from the first pose to the last")
+    _shaped(xi, (len(xi), k, 6), "joint_xi")
+    return JointSamples(node, xi, _shaped(log_scale, (len(xi), k), "joint_log_scale"))
+
+
+def _view(arrays: dict[str, Any]) -> View | None:
+    if "T_body_camera" not in arrays:
+        return None
+    camera = json.loads(str(arrays["camera"]))
+    return View(int(arrays["first_frame"]), se3.check_transforms(arrays["T_body_camera"], "T_body_camera"),
+                None if camera is None else Camera(**camera), float(arrays["prior_log_scale"]))
+
+
+def _shaped(values: Any, shape: tuple[int, ...], key: str) -> Array:
+    array = np.asarray(values, float)
+    if array.shape != shape or not np.isfinite(array).all():
+        raise ValueError(f"{key} has shape {array.shape}, expected {shape} of finite numbers")
+    return array

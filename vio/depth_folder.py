@@ -1,0 +1,72 @@
+"""Depth maps on disk beside a recording: a folder laid out as `mav0/depth0`, such as `predict --depth` writes."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from vio.depth import DepthEncoding, LinearDepth
+from vio.errors import FormatError
+from vio.formats.asl import read_depth_listing
+from vio.image_files import decode_image
+from vio.recording import Recording
+
+PREDICTION = "prediction.json"
+"""Marks maps that a network predicted, one for every frame, metric at the prior scale."""
+NS = 1e-9
+
+
+@dataclass(frozen=True)
+class DepthFolder:
+    """N depth maps, read when asked for."""
+
+    name: str
+    t_ns: NDArray[np.int64]
+    """(N,) stamps."""
+    files: tuple[Path, ...]
+    encoding: DepthEncoding
+    """What the pixels mean."""
+    predicted: bool
+    """Metric at the prior scale of the predictor, not measured."""
+    start_ns: int
+    """Stamp of the recording's first frame."""
+
+    def depth_m(self, t_s: float) -> NDArray[np.float32] | None:
+        """z-depth (H, W) [m] of the frame at a time after the first frame, 0 where unknown; None when not mapped.
+
+        Raises:
+            RecordingError: the map is absent, cut off, undecodable, not of its declared kind, or of unknown scale.
+        """
+        off = np.abs((self.t_ns - self.start_ns) * NS - t_s)
+        k = int(np.argmin(off))
+        if off[k] > 1e-3:
+            return None
+        what = f"{self.name}: depth at {t_s:.3f} s"
+        return self.encoding.depth_m(decode_image(self.files[k], what, depth=True), what)
+
+
+def read_depth_folder(folder: str | Path, recording: Recording | None = None) -> DepthFolder:
+    """Open a folder of depth maps.
+
+    Args:
+        folder: with `data.csv`, `sensor.yaml` and `data/`.
+        recording: the recording they belong to. Without it the first map is taken for the first frame's, which holds
+            for predicted maps only.
+
+    Raises:
+        FormatError: no depth folder, or without a recording no predicted one.
+        VioError: a file of it is unusable, naming file and line.
+    """
+    folder = Path(folder)
+    if not (folder / "data.csv").is_file():
+        raise FormatError(f"{folder.name}: no data.csv; give a folder of depth maps as `predict --depth` writes it")
+    t_ns, files, unit_m, encoding = read_depth_listing(folder)
+    predicted = (folder / PREDICTION).is_file()
+    if recording is None and not predicted:
+        raise FormatError(f"{folder.name}: no {PREDICTION}, so the first map need not be the first frame's; name the "
+                          "recording too")
+    start_ns = int(t_ns[0]) if recording is None else int(recording.frame_t_ns[0])
+    return DepthFolder(folder.resolve().name, t_ns, files, encoding or LinearDepth(unit_m), predicted, start_ns)
