@@ -53,6 +53,11 @@ class WallState:
         second = corner[3] + (1 - a)[:, None] * (corner[2] - corner[3]) + (1 - b)[:, None] * (corner[1] - corner[3])
         return np.asarray(np.where(lower[:, None], first, second))
 
+    def vertices(self) -> Array:
+        """World positions (k, columns, 3) of the grid's vertices."""
+        outward = np.einsum("kcx,cm->kmx", self.across, _DIRECTION)
+        return np.asarray(self.centre_m[:, None] + self.radius_m[..., None] * outward)
+
     def _vertex(self, i: NDArray[np.intp], j: NDArray[np.intp]) -> Array:
         out: Array = self.centre_m[i] + self.radius_m[i, j][:, None] * (
             _DIRECTION[0, j][:, None] * self.across[i, 0] + _DIRECTION[1, j][:, None] * self.across[i, 1])

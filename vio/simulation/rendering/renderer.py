@@ -34,6 +34,9 @@ Supersampling = Literal["none", "edges", "full"]
 
 LEDS_M = np.array([[3.5, 0, -0.5], [-3.5, 0, -0.5], [0, 3.5, -0.5], [0, -3.5, -0.5]]) * 1e-3
 """Positions of the light sources in camera axes."""
+FIXED_GAIN = 160.0
+"""Exposure when auto-exposure is off: right for a wall about 12 mm away."""
+
 SMALLEST, LARGEST = 16, 4096
 _BEHIND_RADII = 1.5  # rows whose centre is this many radii behind the lens cannot be seen by it
 _TURN_HIDES_RAD = 2.3  # a lumen that has bent this far is hidden by its own wall
@@ -245,10 +248,6 @@ class Renderer:
         t = t_s + self.options.exposure_s * (np.arange(MOST_POSES) / (MOST_POSES - 1) - 0.5)
         poses: Array = se3.inverse(T_world_camera) @ self._motion.evaluate(t).T_world_body @ self._T_body_camera
         return poses
-
-
-FIXED_GAIN = 160.0
-"""Exposure when auto-exposure is off: right for a wall about 12 mm away."""
 
 
 def check_renderable(camera: Camera | None) -> Camera:
