@@ -92,7 +92,7 @@ def test_lesions_are_where_the_truth_says(made):
         there = np.array([float(row[f"{axis}_mm"]) for axis in "xyz"]) * 1e-3
         np.testing.assert_allclose(point, there, atol=3e-5)
     for row in truth:
-        mark, seen = marks[int(row["id"])], [s for s in sightings if s["id"] == row["id"]]
+        mark, seen = marks[int(row["id"])], [s for s in sightings if s["mark"] == row["id"]]
         assert row["label"] == mark.label and int(row["frames_seen"]) == len(seen)
         at = np.array([float(row[f"{axis}_mm"]) for axis in "xyz"])
         near = [np.linalg.norm(at - [float(s[f"{axis}_mm"]) for axis in "xyz"]) for s in seen]

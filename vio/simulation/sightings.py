@@ -22,7 +22,7 @@ FEWEST_PIXELS = 12
 
 _TRUTH_COLUMNS = ("id", "label", "kind", "x_mm", "y_mm", "z_mm", "arc_length_mm", "radius_mm", "frames_seen",
                   "first_frame", "last_frame", "best_frame", "best_timestamp_s", "best_u", "best_v")
-_SIGHTING_COLUMNS = ("id", "label", "kind", "frame", "timestamp_s", "u", "v", "pixels", "x_mm", "y_mm", "z_mm")
+_SIGHTING_COLUMNS = ("mark", "label", "kind", "frame", "u", "v", "pixels", "x_mm", "y_mm", "z_mm")
 
 
 @dataclass(frozen=True)
@@ -85,7 +85,10 @@ def find_sightings(marks: Sequence[Mark], frame: int, timestamp_s: float, row: F
 
 
 def write_marks(folder: Path, anatomy: Anatomy, sightings: Iterable[Sighting]) -> None:
-    """Write `lesions.csv`, the truth about every mark that was seen, and `lesion_sightings.csv`, one row per frame."""
+    """Write `lesions.csv`, the truth about every mark that was seen, and `lesion_sightings.csv`, one row per frame.
+
+    The second is what `capsule-vio locate` takes; its `mark` is the `id` of the first.
+    """
     marks = known_marks(anatomy)
     by_mark: dict[int, list[Sighting]] = {}
     for sighting in sorted(sightings, key=lambda s: (s.mark, s.frame)):
@@ -96,8 +99,8 @@ def write_marks(folder: Path, anatomy: Anatomy, sightings: Iterable[Sighting]) -
         arc, position = _at_rest(anatomy, mark)
         truth.append([k, mark.label, mark.kind, *(_mm(x) for x in position), _mm(arc), _mm(mark.radius_m), len(seen),
                       seen[0].frame, seen[-1].frame, best.frame, f"{best.timestamp_s:.6f}", int(best.u), int(best.v)])
-        rows += [[k, mark.label, mark.kind, s.frame, f"{s.timestamp_s:.6f}", int(s.u), int(s.v), s.pixels,
-                  *(_mm(x) for x in s.position_m)] for s in seen]
+        rows += [[k, mark.label, mark.kind, s.frame, int(s.u), int(s.v), s.pixels, *(_mm(x) for x in s.position_m)]
+                 for s in seen]
     _write_table(folder / "lesions.csv", _TRUTH_COLUMNS, truth)
     _write_table(folder / "lesion_sightings.csv", _SIGHTING_COLUMNS, sorted(rows, key=lambda r: (r[3], r[0])))
 
