@@ -40,7 +40,7 @@ class HaustralFolds:
         for k in range(3):
             at = rng.uniform(0, 20)
             while at < 1e3 * wall_length_m:
-                rows.append([at, rng.uniform(1.9, 2.8), self._mm * rng.uniform(0.24, 0.46),
+                rows.append([at, rng.uniform(2.1, 3.0), self._mm * rng.uniform(0.24, 0.46),
                              self._phase + k * TAU / 3 + rng.normal(0, 0.18), rng.uniform(1.25, 1.9),
                              rng.normal(0, 1.6), rng.normal(0, 0.9)])
                 at += rng.uniform(17, 32)

@@ -30,8 +30,8 @@ class Lens:
     sees: NDArray[np.bool_]
     """(H, W) whether light reaches the pixel."""
     numbers: Array
-    """(14,) for `project_point`: fisheye?, fx, fy, cx, cy, k1..k4, p1, p2, widest angle, pixel's angle, and the
-    angle beyond which the model gives no pixels: there points are laid out on and on outside the image."""
+    """(15,) for `project_point`: fisheye?, fx, fy, cx, cy, k1..k4, p1, p2, widest angle, pixel's angle, the angle
+    beyond which the model gives no pixels (there points are laid out on and on outside the image), and its tangent."""
 
 
 def make_lens(camera: Camera, view_circle: bool) -> Lens:
@@ -51,7 +51,7 @@ def make_lens(camera: Camera, view_circle: bool) -> Lens:
     limit = _one_to_one(radial, 3.1 if fisheye else 10.0)
     numbers = [float(fisheye), camera.fx, camera.fy, camera.cx, camera.cy, *radial, p1, p2,
                WIDEST_RAD, 1.0 / math.sqrt(camera.fx * camera.fy),
-               limit if fisheye else math.atan(limit)]
+               limit if fisheye else math.atan(limit), limit]
     return Lens(camera, np.ascontiguousarray(rays), sees, np.array(numbers))
 
 
@@ -67,16 +67,19 @@ def _one_to_one(radial: list[float], largest: float) -> float:
 def project_point(x: float, y: float, z: float, n: Array) -> tuple[float, float, bool]:
     """Pixel of a point in camera axes, and whether it lies within the lens's widest angle."""
     r = math.sqrt(x * x + y * y)
-    angle = math.atan2(r, z)
-    if angle >= n[11]:
-        return 0.0, 0.0, False
-    seen = min(angle, n[13])
-    s = seen if n[0] > 0.5 else math.tan(seen)
-    planar = s / r if r > 1e-12 else 1.0 / z
+    beyond = 0.0
+    if n[0] < 0.5 and r < z * n[14]:
+        s, planar = r / z, 1.0 / z
+    else:
+        angle = math.atan2(r, z)
+        if angle >= n[11]:
+            return 0.0, 0.0, False
+        seen = min(angle, n[13])
+        beyond = angle - seen
+        s = seen if n[0] > 0.5 else math.tan(seen)
+        planar = s / r if r > 1e-12 else 1.0 / z
     q = s * s
-    scale = 1.0 + q * (n[5] + q * (n[6] + q * (n[7] + q * n[8])))
-    if angle > seen:
-        scale *= 1.0 + 3.0 * (angle - seen)
+    scale = 1.0 + q * (n[5] + q * (n[6] + q * (n[7] + q * n[8]))) + 3.0 * beyond
     a, b = x * planar, y * planar
     u = a * scale + 2.0 * n[9] * a * b + n[10] * (q + 2.0 * a * a)
     v = b * scale + n[9] * (q + 2.0 * b * b) + 2.0 * n[10] * a * b

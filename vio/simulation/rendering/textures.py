@@ -23,7 +23,8 @@ TEXEL_M = ROW_M / 4
 LEVELS = 4
 CHANNELS = 8
 _SECTION = 1024  # texels along; a multiple of 2**LEVELS
-_SECTIONS_KEPT = 2  # beside the window: a capsule that goes to and fro needs its neighbours again
+_SECTIONS_KEPT = 6  # a capsule that tumbles or goes to and fro needs its neighbours again
+_DEEP_VESSELS_PER_M2 = 1400.0
 _HALO = 64
 _BLOOD = np.array([0.30, 1.0, 0.75], np.float32)
 _TISSUE = np.array([0.25, 0.8, 1.0], np.float32)
@@ -59,6 +60,7 @@ class Textures:
         grain = {"circular": (0.45e-3, 1.1e-3), "haustral": (0.9e-3, 2.2e-3), "rugae": (1.5e-3, 4e-3)}[organ.folds]
         self._grain = BandNoise((*seed, 24), self.columns, fine, *grain, blocks_kept=2)
         self._sections: Recent[tuple[Field, ...]] = Recent(_SECTIONS_KEPT)
+        self._trees: tuple[Recent[list[Branch]], Recent[list[Branch]]] = (Recent(4), Recent(4))
         self._window: tuple[range, TextureWindow] | None = None
 
     def window(self, low_m: float, high_m: float) -> TextureWindow:
@@ -107,17 +109,27 @@ class Textures:
 
     def _vessels(self, k: int, first: int, rows: int) -> tuple[Field, Field]:
         """Sharp vessels at the surface and blurred ones below it; trees of the neighbouring sections reach in."""
-        area_m2 = _SECTION * TEXEL_M * TAU * self._organ.radius_m
-        trees: list[list[Branch]] = [[], []]
-        for layer, per_m2 in enumerate((self._organ.look.vessels_per_m2, 0.0 if self._organ.look.villi else 1400.0)):
-            for section in (k - 1, k, k + 1):
-                rng = np.random.default_rng([*self._seed, 25 + layer, section + 1_000_000])
-                for points, width in grow(rng, int(rng.poisson(per_m2 * area_m2)), _SECTION, self.columns, TEXEL_M):
-                    trees[layer].append((points + np.array([0.0, section * _SECTION]), width))
-        surface, deep = (paint(branches, first, rows, self.columns) for branches in trees)
+        near = (k - 1, k, k + 1)
+        surface = paint([branch for n in near for branch in self._trees[0].get(n, self._surface_trees)], first, rows,
+                        self.columns)
         if self._organ.look.villi:
-            surface = cv2.GaussianBlur(surface, (0, 0), 1.5)
-        return surface, 0.8 * cv2.GaussianBlur(deep, (0, 0), 5)
+            return cv2.GaussianBlur(surface, (0, 0), 1.5), np.zeros_like(surface)
+        halved = [(0.5 * points, 0.5 * width) for n in near for points, width in self._trees[1].get(n, self._deep_trees)]
+        deep = cv2.GaussianBlur(paint(halved, first / 2, rows // 2, self.columns // 2), (0, 0), 2.5)
+        return surface, 0.8 * cv2.resize(deep, (self.columns, rows), interpolation=cv2.INTER_LINEAR)
+
+    def _surface_trees(self, section: int) -> list[Branch]:
+        return self._grown(25, section, self._organ.look.vessels_per_m2)
+
+    def _deep_trees(self, section: int) -> list[Branch]:
+        return self._grown(26, section, _DEEP_VESSELS_PER_M2)
+
+    def _grown(self, stream: int, section: int, per_m2: float) -> list[Branch]:
+        """Trees that root in a section, in texels from the wall's beginning."""
+        rng = np.random.default_rng([*self._seed, stream, section + 1_000_000])
+        area_m2 = _SECTION * TEXEL_M * TAU * self._organ.radius_m
+        grown = grow(rng, int(rng.poisson(per_m2 * area_m2)), _SECTION, self.columns, TEXEL_M)
+        return [(points + np.array([0.0, section * _SECTION]), width) for points, width in grown]
 
     def _bubbles(self, k: int, first: int, film_mm: Field) -> tuple[Field, Field]:
         """The film with patches of bubbles on it, and where they are."""
