@@ -114,7 +114,8 @@ class Textures:
                         self.columns)
         if self._organ.look.villi:
             return cv2.GaussianBlur(surface, (0, 0), 1.5), np.zeros_like(surface)
-        halved = [(0.5 * points, 0.5 * width) for n in near for points, width in self._trees[1].get(n, self._deep_trees)]
+        halved = [(0.5 * points, 0.5 * width)
+                  for n in near for points, width in self._trees[1].get(n, self._deep_trees)]
         deep = cv2.GaussianBlur(paint(halved, first / 2, rows // 2, self.columns // 2), (0, 0), 2.5)
         return surface, 0.8 * cv2.resize(deep, (self.columns, rows), interpolation=cv2.INTER_LINEAR)
 
