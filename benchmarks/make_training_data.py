@@ -35,8 +35,8 @@ def sequences(part: str, count: int, first_seed: int, duration_s: float) -> Iter
         organ, camera = views[(4 * k) % len(views)]
         vibration = VIBRATIONS[k % len(VIBRATIONS)]
         level = 0 if vibration == "none" else LEVELS[k % len(LEVELS)]
-        yield Sequence(f"{part}/{k:02d}", organ, vibration, level, DRIVINGS[k % len(DRIVINGS)], first_seed + k, duration_s,
-                       camera, SIZE)
+        yield Sequence(f"{part}/{k:02d}", organ, vibration, level, DRIVINGS[k % len(DRIVINGS)], first_seed + k,
+                       duration_s, camera, SIZE)
 
 
 def main() -> None:

@@ -86,8 +86,8 @@ def calibrated(measured: Sequence[Measured]) -> dict[str, Any]:
     used = [m for m in measured if np.isfinite(m.log_scale)]
     pairs = sum(len(m) for m in used)
     if pairs < LEAST_PAIRS:
-        raise TrainingError(f"calibration: {pairs} pairs with truth in {len(used)} recordings that move (limit: at least "
-                            f"{LEAST_PAIRS}); give more or longer recordings with truth")
+        raise TrainingError(f"calibration: {pairs} pairs with truth in {len(used)} recordings that move (limit: at "
+                            f"least {LEAST_PAIRS}); give more or longer recordings with truth")
     scales = np.array([m.log_scale for m in used])
     errors = np.concatenate([m.errors(m.log_scale) for m in used])
     signals = np.concatenate([m.signals for m in used])

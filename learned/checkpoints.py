@@ -19,7 +19,8 @@ from learned.train_config import TrainConfig, different_decisions, train_config_
 from vio.atomic import atomic_write
 
 SCHEMA = 1
-KEYS = ("step", "model", "average", "average_updates", "optimiser", "rng", "world", "recordings", "early_stop", "skipped")
+KEYS = ("step", "model", "average", "average_updates", "optimiser", "rng", "world", "recordings", "early_stop",
+        "skipped")
 
 
 def save_checkpoint(path: str | Path, config: TrainConfig, state: Mapping[str, Any]) -> None:
@@ -51,16 +52,16 @@ def load_checkpoint(path: str | Path, config: TrainConfig, world: int, recording
     except OSError as error:
         raise CheckpointError(f"checkpoint {name}: {error.strerror or 'cannot be read'}; start a new run") from None
     except (RuntimeError, ValueError, EOFError, pickle.UnpicklingError, zipfile.BadZipFile):
-        raise CheckpointError(f"checkpoint {name}: damaged, or no checkpoint; start a new run in another folder") from None
+        raise CheckpointError(f"checkpoint {name}: damaged, or none; start a new run in another folder") from None
     if not isinstance(content, dict) or content.get("schema") != SCHEMA or any(key not in content for key in KEYS):
         raise CheckpointError(f"checkpoint {name}: not written by this version of training; start a new run")
     different = different_decisions(train_config_from_dict(json.loads(content["config"])), config)
     if different:
-        raise CheckpointError(f"checkpoint {name}: its run has another {', '.join(different)}; give the same decisions, "
-                              "or start a new run in another folder")
+        raise CheckpointError(f"checkpoint {name}: its run has another {', '.join(different)}; give the same "
+                              "decisions, or start a new run in another folder")
     if content["world"] != world:
-        raise CheckpointError(f"checkpoint {name}: written by {content['world']} process(es), this run has {world}; use "
-                              "as many, for the order of the data depends on it")
+        raise CheckpointError(f"checkpoint {name}: written by {content['world']} process(es), this run has {world}; "
+                              "use as many, for the order of the data depends on it")
     if content["recordings"] != recordings:
         raise CheckpointError(f"checkpoint {name}: its run saw other recordings; give the same, in the same order")
     return content

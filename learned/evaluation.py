@@ -1,7 +1,7 @@
 """How good predictions are on recordings with truth, and how good guesses are that need no network.
 
-Depth: AbsRel = mean |d - d*| / d*, Acc = share of pixels with max(d/d*, d*/d) < 1.25, after one median scale per image or
-per recording. Motion: angle of the rotation's error, angle between translations where the camera moves, error of the
+Depth: AbsRel = mean |d - d*| / d*, Acc = share of pixels with max(d/d*, d*/d) < 1.25, after one median scale per image
+or per recording. Motion: angle of the rotation's error, angle between translations where the camera moves, error of the
 step after one least-squares scale per recording.
 """
 

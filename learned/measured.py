@@ -1,4 +1,4 @@
-"""Trained weights at work on a recording whose truth is known: predictions beside truth, for calibration and evaluation."""
+"""Trained weights at work on a recording whose truth is known: predictions beside truth."""
 
 from __future__ import annotations
 

@@ -99,8 +99,8 @@ def predictor_for(recording: Recording, weights: Weights, device: str | None = N
         raise WeightsError(f"weights {name}: their uncertainty was never calibrated; run `capsule-vio train` with "
                            "recordings that have truth")
     if method.config.vibration and len(recording.imu) < 2:
-        raise ImuError(f"recording {recording.name}: {len(recording.imu)} inertial samples, but the weights {name} look "
-                       "at vibration; add imu0/data.csv, give vision-only weights, or use --method classical")
+        raise ImuError(f"recording {recording.name}: {len(recording.imu)} inertial samples, but the weights {name} "
+                       "look at vibration; add imu0/data.csv, give vision-only weights, or use --method classical")
     chosen = torch.device(device or ("cuda" if torch.cuda.is_available() else "cpu"))
     camera = _fitting_camera(recording, weights)
     return NetworkPredictor(replace(weights, method=method.to(chosen)), camera,
@@ -111,20 +111,20 @@ def _fitting_camera(recording: Recording, weights: Weights) -> Camera:
     """The recording's camera at the network's size."""
     camera = recording.calibration.camera
     if camera is None:
-        raise CameraError(f"recording {recording.name}: no camera is calibrated, and depth and motion depend on it; add "
-                          "intrinsics to cam0/sensor.yaml")
+        raise CameraError(f"recording {recording.name}: no camera is calibrated, and depth and motion depend on it; "
+                          "add intrinsics to cam0/sensor.yaml")
     height, width = weights.method.config.image_size
     small = camera.resized(width, height)
     size = f"{camera.width} x {camera.height} pixels, at the network's {width} x {height}"
     if max(small.fx / small.fy, small.fy / small.fx) > SQUARE_SLACK:
-        raise CameraError(f"recording {recording.name}: {size} the focal lengths are {small.fx:.0f} and {small.fy:.0f} "
-                          f"(limit: a ratio of {SQUARE_SLACK:g}), so the image would be squeezed; crop the frames to a "
-                          "square, or use --method classical")
+        raise CameraError(f"recording {recording.name}: {size} the focal lengths are {small.fx:.0f} and "
+                          f"{small.fy:.0f} (limit: a ratio of {SQUARE_SLACK:g}), so the image would be squeezed; crop "
+                          "the frames to a square, or use --method classical")
     focal = weights.card.get("focal_px")
     if focal is not None:
         low, high = min(focal) / FOCAL_SLACK, max(focal) * FOCAL_SLACK
         if not low <= small.fx <= high:
-            raise CameraError(f"recording {recording.name}: {size} the focal length is {small.fx:.0f} (limit: {low:.0f} "
-                              f"to {high:.0f}, around what the weights {weights.name} were trained on); train on such a "
-                              "camera, or use --method classical")
+            raise CameraError(f"recording {recording.name}: {size} the focal length is {small.fx:.0f} (limit: "
+                              f"{low:.0f} to {high:.0f}, around what the weights {weights.name} were trained on); "
+                              "train on such a camera, or use --method classical")
     return small

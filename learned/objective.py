@@ -1,4 +1,4 @@
-"""The number that training makes small, for every method: networks on a batch, then the method's own loss or the paper's.
+"""The number that training makes small, for every method: networks, then the method's own loss or the paper's.
 
 No truth enters. What the gyro says about rotation is a measurement; it may take the network's place in the warp.
 """
@@ -16,7 +16,15 @@ from learned.camera_rays import CameraBatch
 from learned.dataset import TripletBatch
 from learned.errors import NetworkInputError
 from learned.lie import so3_log, transform
-from learned.losses.appearance_flow import AF_SFM, ENDODAC, Registered, appearance_loss, flow_loss, register
+from learned.losses.appearance_flow import (
+    AF_SFM,
+    ENDODAC,
+    AppearanceFlow,
+    Registered,
+    appearance_loss,
+    flow_loss,
+    register,
+)
 from learned.losses.consistency import ENDOSFM, MEASURED, PAPER, Consistency, consistency_loss
 from learned.losses.masks import visible_from
 from learned.losses.priors import depth_like_light, rotation_from_gyro
@@ -157,7 +165,7 @@ class Objective(nn.Module):
             registered, batch.usable, settings)
         return LossTerms(terms.total, dict(terms.parts) | _snr(out))
 
-    def _appearance_settings(self) -> object:
+    def _appearance_settings(self) -> AppearanceFlow:
         base = ENDODAC if self.config.method.name == "endodac" else AF_SFM
         return replace(base, depth_kind=self.config.depth_kind)
 

@@ -94,8 +94,8 @@ class TrainConfig:
             if not getattr(self, name) >= 0:
                 raise ConfigError(f"training: {name} is {getattr(self, name)}, must not be negative")
         if not (self.learning_rate > 0 and 0 <= self.ema_decay < 1 and 0 <= self.final_rate <= 1):
-            raise ConfigError(f"training: learning_rate {self.learning_rate:g}, ema_decay {self.ema_decay:g}, final_rate "
-                              f"{self.final_rate:g}; need > 0, in [0, 1) and in [0, 1]")
+            raise ConfigError(f"training: learning_rate {self.learning_rate:g}, ema_decay {self.ema_decay:g}, "
+                              f"final_rate {self.final_rate:g}; need > 0, in [0, 1) and in [0, 1]")
 
     @property
     def needs_imu(self) -> bool:

@@ -28,7 +28,7 @@ class TrainLog:
         if tensorboard and find_spec("tensorboard") is not None:
             from torch.utils.tensorboard import SummaryWriter
 
-            self._board = SummaryWriter(str(path.parent / "tensorboard"), purge_step=resume_step)  # type: ignore[no-untyped-call]
+            self._board = SummaryWriter(str(path.parent / "tensorboard"), purge_step=resume_step)
 
     def write(self, step: int, values: Mapping[str, float]) -> None:
         """Append one row, at once on disk."""

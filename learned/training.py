@@ -108,7 +108,8 @@ class Trainer:
         settings = source_settings(config)
         self.data = TripletDataset(self.recordings, settings, "train", config.seed, config.augment)
         self.held = TripletDataset(self.recordings, settings, "validation", config.seed, augment=False)
-        self.sampler = DistributedSampler(self.data, members.size, members.rank, seed=config.seed, drop_last=True)
+        self.sampler: DistributedSampler[Any] = DistributedSampler(
+            self.data, members.size, members.rank, seed=config.seed, drop_last=True)
         self.method = assemble(config.method, seed=config.seed)
         if config.method.vibration:
             self.method.fit_vibration_normalisation(_windows(self.data))
@@ -193,8 +194,9 @@ class Trainer:
         self.lost_in_a_row += 1
         if self.lost_in_a_row >= MOST_LOST:
             wrong = [name for name, value in parts.items() if not torch.isfinite(value).all()]
-            raise TrainingError(f"training: no finite gradient in {MOST_LOST} steps up to step {self.step} (not finite: "
-                                f"{', '.join(wrong) or 'gradients only'}); lower the learning rate or use float32")
+            raise TrainingError(f"training: no finite gradient in {MOST_LOST} steps up to step {self.step} "
+                                f"(not finite: {', '.join(wrong) or 'gradients only'}); lower the learning rate "
+                                "or use float32")
 
     def _batches(self) -> Iterator[TripletBatch]:
         """Batches from where the run stands, epoch after epoch."""
@@ -240,8 +242,8 @@ class Trainer:
             rows.append({"loss": float(total), **{name: float(value) for name, value in parts.items()}})
         self.method.load_state_dict(kept)
         self.objective.train()
-        means = {name: sum(row[name] for row in rows) / len(rows) for name in rows[0]} if rows else {}
-        self.validation = self.members.mean(means)
+        every = [row for some in self.members.gathered(rows) for row in some]
+        self.validation = {name: sum(row[name] for row in every) / len(every) for name in every[0]}
         if self.logs is not None:
             self.logs[1].write(self.step, self.validation)
         self.stopped = self.early_stop.sees(self.validation["loss"], self.config.patience)

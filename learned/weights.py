@@ -1,7 +1,7 @@
 """Weights on disk: safetensors with a card that says what they are, and a digest that shows when they changed.
 
-The card is JSON in the file's metadata: the method and its decisions, how and on what it was trained, what was measured,
-the scale prior and the uncertainty model, and the SHA-256 of the tensors. No pickle is ever opened.
+The card is JSON in the file's metadata: the method and its decisions, how and on what it was trained, what was
+measured, the scale prior and the uncertainty model, and the SHA-256 of the tensors. No pickle is ever opened.
 """
 
 from __future__ import annotations
@@ -125,7 +125,7 @@ def _read(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:
         raise WeightsError(f"weights {name}: a pickle, which can run code when it is opened; give safetensors")
     try:
         with safetensors.safe_open(path, framework="pt") as opened:
-            return {key: opened.get_tensor(key) for key in opened.keys()}, dict(opened.metadata() or {})
+            return {key: opened.get_tensor(key) for key in list(opened.keys())}, dict(opened.metadata() or {})
     except (safetensors.SafetensorError, OSError):
         raise WeightsError(f"weights {name}: damaged, or no safetensors file; get it again") from None
 
