@@ -57,3 +57,8 @@ def team(device: str | None = None) -> Iterator[Team]:
         yield Team(rank, size, torch.device(kind, local) if kind == "cuda" else torch.device(kind))
     finally:
         dist.destroy_process_group()
+
+
+def leads() -> bool:
+    """Whether this process is the first of those that torchrun started, or the only one."""
+    return os.environ.get("RANK", "0") == "0"

@@ -75,18 +75,20 @@ def mean_inverse_depth(measured: Sequence[Measured]) -> Maps:
     return np.asarray(1 / np.maximum(mean, 1.0), np.float32)
 
 
-def trivial_depths(measured: Sequence[Measured], prior: Maps) -> dict[str, list[Maps]]:
+def trivial_depths(measured: Sequence[Measured], prior: Sequence[Maps]) -> dict[str, list[Maps]]:
     """Depth without a network, per name and recording.
 
     Args:
         measured: the recordings to guess for.
-        prior: (H, W) from `mean_inverse_depth` of training recordings with the same camera, or of all.
+        prior: (H, W) for each, from `mean_inverse_depth` of training recordings with the same camera.
     """
     light = [depth_from_light(torch.from_numpy(m.images).permute(0, 3, 1, 2).float() / 255)[:, 0].numpy()
              for m in measured]
-    both = [np.asarray(np.sqrt(one / np.median(one) * prior / np.median(prior)), np.float32) for one in light]
+    both = [np.asarray(np.sqrt(one / np.median(one) * mean / np.median(mean)), np.float32)
+            for one, mean in zip(light, prior, strict=True)]
     return {"constant": [np.full_like(m.depth, 0.015) for m in measured],
-            "mean inverse depth of training": [np.broadcast_to(prior, m.depth.shape) for m in measured],
+            "mean inverse depth": [np.broadcast_to(mean, m.depth.shape)
+                                   for m, mean in zip(measured, prior, strict=True)],
             "brightness^-1/2": light, "geometric mean of the last two": both}
 
 

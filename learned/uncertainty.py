@@ -20,8 +20,8 @@ from learned.errors import WeightsError
 Array = NDArray[np.float64]
 
 GROUPS = ((0, 1), (2,), (3, 4), (5,))
-"""Degrees of freedom (rotation x, y, z, translation x, y, z in camera axes) that share their coefficients: the image
-plane's two directions are alike."""
+"""Degrees of freedom (rotation x, y, z, translation x, y, z in camera axes) that share their coefficients, but for
+the constant: the image plane's two directions are alike."""
 RIDGE = 0.5
 """Penalty on the coefficients of the signals, in errors' worth."""
 FARTHEST = 2.5
@@ -107,7 +107,8 @@ def fit_uncertainty(errors: Array, signals: Array, names: Sequence[str], chosen:
         log_sd[list(group)] = _fit_log_sd(np.abs(errors[:, list(group)]), design)
     scaled = errors / np.exp(design @ log_sd.T)
     second = scaled.T @ scaled / len(scaled)
-    root = np.sqrt(np.diag(second))
+    root = np.sqrt(np.maximum(np.diag(second), 1e-12))
+    log_sd[:, 0] += np.log(root)  # the group's law, each degree of freedom at its own size
     return UncertaintyModel(tuple(chosen), mean, sd, log_sd, _positive(second / np.outer(root, root)))
 
 
