@@ -41,7 +41,7 @@ def card_of(run: TrainedRun, trained_on: Sequence[Recording]) -> dict[str, Any]:
 
 
 def write_calibrated(run: TrainedRun, trained_on: Sequence[Recording], calibrate_on: Sequence[Recording],
-                     path: str | Path) -> dict[str, Any]:
+                     path: str | Path, history: Sequence[str] = ()) -> dict[str, Any]:
     """Write a run's weights, then calibrate what was written, and write the card.
 
     Args:
@@ -49,6 +49,7 @@ def write_calibrated(run: TrainedRun, trained_on: Sequence[Recording], calibrate
         trained_on: its recordings.
         calibrate_on: other recordings with truth; none = the validation part of those trained on.
         path: ends in .safetensors.
+        history: what the run's start weights went through before, one line a stage.
 
     Returns:
         The card.
@@ -58,7 +59,7 @@ def write_calibrated(run: TrainedRun, trained_on: Sequence[Recording], calibrate
         RecordingError, ImuError: recordings that cannot be measured.
         OutputError: the file cannot be written.
     """
-    card = card_of(run, trained_on)
+    card = card_of(run, trained_on) | {"history": list(history)}
     save_weights(path, run.method, card)
     method = load_weights(path).method  # as rounded in the file
     measured = measured_parts(method, run, trained_on, calibrate_on)

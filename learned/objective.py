@@ -55,6 +55,15 @@ class Objective(nn.Module):
         self.stages: tuple[str, ...] = ("flow", "motion") if self.with_flows else ("motion",)
         """Losses of one training step, in order; their weights are disjoint."""
 
+    def train(self, mode: bool = True) -> Objective:
+        """Train or eval mode; frozen batch norms stay in eval mode."""
+        super().train(mode)
+        if self.config.freeze_batch_norm:
+            for module in self.modules():
+                if isinstance(module, nn.modules.batchnorm._BatchNorm):
+                    module.eval()
+        return self
+
     def forward(self, batch: TripletBatch, step: int = 0, stage: str = "motion") -> tuple[Tensor, dict[str, Tensor]]:
         """The loss and its parts.
 

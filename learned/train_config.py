@@ -63,6 +63,9 @@ class TrainConfig:
     precision: Precision = "float32"
     """bfloat16: networks under autocast; losses stay in float32."""
     channels_last: bool = False
+    freeze_batch_norm: bool = False
+    """Normalise by the running statistics that the start weights bring. A batch of two scenes normalises the size of
+    their motion away, and a network trained so predicts smaller motions once it is used."""
     augment: bool = True
     """Mirror and turn the items."""
     workers: int = 0

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -68,7 +68,7 @@ class _EarlyStop:
 
 
 def train(recordings: Sequence[Recording], config: TrainConfig, out: str | Path, *, device: str | None = None,
-          progress: Progress | None = None) -> TrainedRun:
+          progress: Progress | None = None, start_from: Mapping[str, Tensor] | None = None) -> TrainedRun:
     """Train, or go on training.
 
     Under `torchrun` all processes call this; the first writes the files.
@@ -79,6 +79,7 @@ def train(recordings: Sequence[Recording], config: TrainConfig, out: str | Path,
         out: folder of the run.
         device: "cpu" or "cuda"; None = cuda where there is one.
         progress: called with (steps done, steps in all) after every step.
+        start_from: weights to start a new run with, by name; None = drawn from the seed.
 
     Raises:
         CheckpointError: the folder's checkpoint is damaged, or of a run with other decisions.
@@ -87,7 +88,7 @@ def train(recordings: Sequence[Recording], config: TrainConfig, out: str | Path,
         OutputError: the folder cannot be written.
     """
     with team(device) as members:
-        trainer = Trainer(recordings, config, Path(out), members)
+        trainer = Trainer(recordings, config, Path(out), members, start_from)
         trainer.resume()
         trainer.run(progress)
         return trainer.result()
@@ -101,6 +102,7 @@ class Trainer:
     config: TrainConfig
     out: Path
     members: Team = field(default_factory=Team)
+    start_from: Mapping[str, Tensor] | None = None
 
     def __post_init__(self) -> None:
         config, members = self.config, self.members
@@ -113,6 +115,8 @@ class Trainer:
         self.method = assemble(config.method, seed=config.seed)
         if config.method.vibration:
             self.method.fit_vibration_normalisation(_windows(self.data))
+        if self.start_from is not None:
+            self.method.load_state_dict(dict(self.start_from))
         layout = torch.channels_last if config.channels_last else torch.contiguous_format
         self.method.to(members.device, memory_format=layout)  # type: ignore[call-overload]
         self.objective = Objective(self.method, config).train()
