@@ -20,7 +20,7 @@ from vio.atomic import atomic_write
 
 SCHEMA = 1
 KEYS = ("step", "model", "average", "average_updates", "optimiser", "rng", "world", "recordings", "early_stop",
-        "skipped")
+        "skipped", "summed")
 
 
 def save_checkpoint(path: str | Path, config: TrainConfig, state: Mapping[str, Any]) -> None:

@@ -113,7 +113,8 @@ MEASURED_RECIPE: dict[str, Any] = {
     "rotation_from": "gyro", "rotation_weight": 1.0, "unit_depth_weight": 0.2, "light_start_steps": 150,
     "depth_kind": "range", "precision": "bfloat16", "channels_last": True,
 }
-"""What was measured to train our own method within minutes: ten times the paper's rate, the gyro in the warp."""
+"""What was measured to train our own method within minutes: ten times the paper's rate, the gyro in the warp. Give it
+batches of at least four scenes a process, or freeze the batch norms once their statistics are known."""
 MEASURED_FUSION = FusionConfig("fourier", snr_start=4.0, snr_floor=1.0)
 """SNR from where the gain's slope is 0.04 (at 100 it was measured not to learn at all), and never below 1: without that
 floor the last block of the pose network, which no batch norm follows, fell to 0.1 within 150 steps and took motion

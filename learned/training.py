@@ -127,6 +127,8 @@ class Trainer:
         self.early_stop, self.validation = _EarlyStop(), dict[str, float]()
         self.digests = [_digest(recording) for recording in self.recordings]
         self.logs: tuple[TrainLog, TrainLog] | None = None
+        self.sums: dict[str, Tensor] = {}
+        self.summed = 0
 
     def resume(self) -> None:
         """Take up the folder's checkpoint, if there is one."""
@@ -149,15 +151,13 @@ class Trainer:
         if self.members.size > 1:
             devices = [self.members.device.index] if self.members.device.type == "cuda" else None
             model = DistributedDataParallel(model, devices, find_unused_parameters=self.objective.with_flows)
-        sums: dict[str, Tensor] = {}
         batches = self._batches()
         while self.step < config.steps and not self.stopped:
             parts = self._one_step(model, next(batches))
-            sums = {name: sums.get(name, 0) + value for name, value in parts.items()}
-            self.step += 1
+            self.sums = {name: self.sums.get(name, 0) + value for name, value in parts.items()}
+            self.step, self.summed = self.step + 1, self.summed + 1
             if self.step % config.log_every == 0 or self.step == config.steps:
-                self._log(sums, (self.step - 1) % config.log_every + 1)
-                sums = {}
+                self._log()
             if self.step % config.validate_every == 0 or self.step == config.steps:
                 self._validate()
             if self.step % config.checkpoint_every == 0 or self.step == config.steps or self.stopped:
@@ -223,8 +223,9 @@ class Trainer:
         return DataLoader(data, batch_sampler=batches, num_workers=self.config.workers, collate_fn=collate,
                           pin_memory=self.members.device.type == "cuda", generator=torch.Generator().manual_seed(0))
 
-    def _log(self, sums: dict[str, Tensor], count: int) -> None:
-        values = self.members.mean({name: float(value) / count for name, value in sums.items()})
+    def _log(self) -> None:
+        values = self.members.mean({name: float(value) / self.summed for name, value in self.sums.items()})
+        self.sums, self.summed = {}, 0
         if self.logs is not None:
             values |= {"learning_rate": self.config.learning_rate * rate(self.config, self.step - 1),
                        "skipped": float(self.skipped)}
@@ -253,13 +254,13 @@ class Trainer:
         self.stopped = self.early_stop.sees(self.validation["loss"], self.config.patience)
 
     def _save(self) -> None:
-        states = self.members.gathered(_random_state(self.members.device))
+        states = self.members.gathered(_random_state(self.members.device) | {"sums": self.sums})
         if not self.members.leads:
             return
         save_checkpoint(self.out / CHECKPOINT, self.config, {
             "step": self.step, "model": self.method.state_dict(), "average": self.average.values,
             "average_updates": self.average.updates, "optimiser": self.optimiser.state_dict(), "rng": states,
-            "world": self.members.size, "recordings": self.digests, "skipped": self.skipped,
+            "world": self.members.size, "recordings": self.digests, "skipped": self.skipped, "summed": self.summed,
             "early_stop": [self.early_stop.best, self.early_stop.worse, self.stopped, self.lost_in_a_row],
             "validation": self.validation})
         if self.config.keep_every and self.step % self.config.keep_every == 0:
@@ -275,6 +276,7 @@ class Trainer:
         best, worse, self.stopped, self.lost_in_a_row = state["early_stop"]
         self.early_stop = _EarlyStop(best, worse)
         random = state["rng"][self.members.rank]
+        self.sums, self.summed = random["sums"], state["summed"]
         torch.set_rng_state(random["cpu"])
         if "cuda" in random and self.members.device.type == "cuda":
             torch.cuda.set_rng_state(random["cuda"], self.members.device)
@@ -302,8 +304,8 @@ def _windows(data: TripletDataset) -> Tensor:
     return torch.cat([data.windows(k) for k in chosen])
 
 
-def _random_state(device: torch.device) -> dict[str, Tensor]:
-    state = {"cpu": torch.get_rng_state()}
+def _random_state(device: torch.device) -> dict[str, Any]:
+    state: dict[str, Any] = {"cpu": torch.get_rng_state()}
     if device.type == "cuda":
         state["cuda"] = torch.cuda.get_rng_state(device)
     return state

@@ -88,7 +88,7 @@ def ball_folder(ball) -> Path:
 
 
 def test_a_killed_run_ends_with_the_weights_of_an_uninterrupted_one(ball, tmp_path):
-    config = tiny(steps=9, ema_decay=0.9)
+    config = tiny(steps=9, ema_decay=0.9, log_every=2)
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
     try:
@@ -199,6 +199,21 @@ def test_validation_leaves_the_run_as_it_was(ball, tmp_path):
     often, never = (train([ball], tiny(steps=4, validate_every=every), tmp_path / str(every)).method.state_dict()
                     for every in (1, 100))
     assert all(torch.equal(often[name], never[name]) for name in often)
+
+
+def test_frozen_batch_norms_train_as_they_are_used(ball, tmp_path):
+    warm = train([ball], tiny(steps=3, ema_decay=0.0), tmp_path / "warm").method.state_dict()
+    config = tiny(freeze_batch_norm=True, dropout=0.0, light_start_steps=0, ema_decay=0.0)
+    trainer = Trainer([ball], config, tmp_path, start_from=warm)
+    assert all(torch.equal(value, warm[name]) for name, value in trainer.method.state_dict().items())
+    batch = next(trainer._batches())
+    with torch.no_grad():
+        training, use = trainer.objective(batch, 0)[0], trainer.objective.eval()(batch, 0)[0]
+    torch.testing.assert_close(training, use)
+    trainer._one_step(trainer.objective.train(), batch)
+    after = trainer.method.state_dict()
+    assert all(torch.equal(after[name], warm[name]) for name in warm if "running" in name)
+    assert not torch.equal(after["pose.rotation.weight"], warm["pose.rotation.weight"])
 
 
 def test_it_stops_when_validation_no_longer_improves(ball, tmp_path):
