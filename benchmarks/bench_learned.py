@@ -110,6 +110,22 @@ def target_rows(evaluation: Evaluation) -> list[list[str]]:
                     "**no**"]]
 
 
+def better_guesses(evaluation: Evaluation) -> str:
+    """Where something without a network does better, metric by metric."""
+    lines = []
+    for scores, metrics in ((evaluation.depth, {"abs_rel_image": 1, "acc_image": -1, "abs_rel_sequence": 1,
+                                                "acc_sequence": -1}),
+                            (evaluation.motion, {"rotation_deg": 1, "direction_deg": 1, "step_mm": 1,
+                                                 "length_correlation": -1})):
+        for metric, sign in metrics.items():
+            own = getattr(scores["network"], metric)
+            wins = [name for name, score in scores.items() if not name.startswith("network")
+                    and sign * getattr(score, metric) < sign * own]
+            if wins:
+                lines.append(f"`{metric}`: {', '.join(wins)}")
+    return "Guesses that beat the network – " + ("; ".join(lines) or "none") + "."
+
+
 def trajectory_rows(runs: list[EndToEnd]) -> list[list[str]]:
     """One line per recording, and the medians."""
     rows = [[r.name, f"{r.path_mm:.0f}", f"{r.alone_mm:.1f}", f"{r.gyro_mm:.1f}", f"{r.refined_mm:.1f}",
@@ -161,6 +177,7 @@ def main() -> None:
     parser.add_argument("data", type=Path)
     parser.add_argument("--weights", type=Path)
     parser.add_argument("--name", default="learned")
+    parser.add_argument("--note", default="", help="a remark for the page")
     args = parser.parse_args()
     torch.set_num_threads(int(os.environ["OMP_NUM_THREADS"]))
     weights, held_out = load_weights(args.weights), part(args.data, "held-out")
@@ -177,7 +194,10 @@ def main() -> None:
         f"{evaluation.recordings} held-out recordings, {evaluation.pairs} pairs of frames; weights of "
         f"`{card['method']['name']}`, {card['steps']} steps on {card['data']['summary']}. No truth in the training "
         "loss; scale and covariances calibrated on recordings of their own.",
-        "## Targets\n\n" + table(["what", "target", "measured", "reached"], target_rows(evaluation)),
+        "## Targets\n\n" + table(["what", "target", "measured", "reached"], target_rows(evaluation))
+        + "\n\n" + better_guesses(evaluation) + (f"\n\n{args.note}" if args.note else ""),
+        "## How the weights came about\n\n" + "\n".join(f"- {line}" for line in card.get("history", []))
+        + f"\n- in all {card['steps']} steps in the last stage, {card['skipped_steps']} skipped",
         "## Depth\n\nAbsRel and Acc(1.25) after one median scale per image and per sequence. The guesses know the mean "
         "inverse depth of the training recordings with the same camera.\n\n"
         + table(DEPTH_HEADER, depth_rows(evaluation)),

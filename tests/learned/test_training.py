@@ -117,8 +117,8 @@ def test_a_killed_run_ends_with_the_weights_of_an_uninterrupted_one(ball, tmp_pa
 
 def test_two_processes_take_the_mean_gradient(ball, tmp_path):
     config = tiny(steps=1, batch_size=1, ema_decay=0.0, validate_every=9, light_start_steps=0, dropout=0.0)
-    process = start(ball, tmp_path / "two", config, "-m", "torch.distributed.run", "--nproc_per_node", "2",
-                    "--master_port", "29655")
+    process = start(ball, tmp_path / "two", config, "-m", "torch.distributed.run", "--standalone", "--nproc_per_node",
+                    "2")
     _, errors = process.communicate(timeout=200)
     assert process.returncode == 0, errors.decode()[-2000:]
     found = torch.load(tmp_path / "two" / "checkpoint.pt", weights_only=True)
