@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import argparse
 import os
+import sys
 import time
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,6 +17,7 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import numpy as np
 import torch
+from make_training_data import plan
 from results import RESULTS, record, table
 
 import learned
@@ -31,6 +33,7 @@ from learned.weights import Weights, load_weights
 from vio.camera import Camera
 from vio.metrics import ate
 from vio.recording import Recording
+from vio.simulation.dataset import write_dataset
 
 TARGETS = (("depth AbsRel, one scale per image", 0.11, "≤"), ("depth Acc, one scale per image, %", 88.0, "≥"),
            ("depth AbsRel, one scale per sequence", 0.13, "≤"), ("rotation, network alone, °", 1.5, "≤"),
@@ -98,16 +101,20 @@ def speed(recording: Recording, weights: Path | None) -> float:
     return len(recording) / (time.perf_counter() - start)
 
 
-def target_rows(evaluation: Evaluation) -> list[list[str]]:
+def target_rows(evaluation: Evaluation, runs: list[EndToEnd]) -> list[list[str]]:
     """What was to be reached, and what was."""
     depth, motion = evaluation.depth["network"], evaluation.motion
     values = (depth.abs_rel_image, 100 * depth.acc_image, depth.abs_rel_sequence, motion["network"].rotation_deg,
               motion["network with gyro"].rotation_deg, motion["network"].direction_deg)
-    rows = [[name, f"{sign} {limit:g}", f"{value:.3g}", "yes" if (value <= limit) == (sign == "≤") else "**no**"]
+    rows = [[name, f"{sign} {limit:g}", f"{value:.2f}", "yes" if (value <= limit) == (sign == "≤") else "**no**"]
             for (name, limit, sign), value in zip(TARGETS, values, strict=True)]
     nees = evaluation.nees or float("nan")
+    ratio = np.array([r.refined_mm / r.alone_mm for r in runs])
     return [*rows, ["motion NEES per degree of freedom", "0.5 – 2", f"{nees:.2f}", "yes" if 0.5 <= nees <= 2 else
-                    "**no**"]]
+                    "**no**"],
+            ["ATE refined / alone, median", "≤ 0.5", f"{np.median(ratio):.2f}", "yes" if np.median(ratio) <= 0.5 else
+             "**no**"],
+            ["ATE refined / alone, worst", "≤ 1", f"{ratio.max():.2f}", "yes" if ratio.max() <= 1 else "**no**"]]
 
 
 def better_guesses(evaluation: Evaluation) -> str:
@@ -174,12 +181,14 @@ def picture(measured: list[Measured]) -> None:
 def main() -> None:
     """Measure everything and record one page."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("data", type=Path)
+    parser.add_argument("data", type=Path, nargs="?", default=Path("out/training_data"), help="rendered if missing")
     parser.add_argument("--weights", type=Path)
     parser.add_argument("--name", default="learned")
     parser.add_argument("--note", default="", help="a remark for the page")
     args = parser.parse_args()
+    sys.argv = [word for word in sys.argv if word not in ("--note", args.note)]  # a remark is no part of the command
     torch.set_num_threads(int(os.environ["OMP_NUM_THREADS"]))
+    write_dataset(plan(), args.data)
     weights, held_out = load_weights(args.weights), part(args.data, "held-out")
     measured = [measure(weights.method, weights.card["depth_kind"], recording) for recording in held_out]
     height, width = weights.method.config.image_size
@@ -194,20 +203,23 @@ def main() -> None:
         f"{evaluation.recordings} held-out recordings, {evaluation.pairs} pairs of frames; weights of "
         f"`{card['method']['name']}`, {card['steps']} steps on {card['data']['summary']}. No truth in the training "
         "loss; scale and covariances calibrated on recordings of their own.",
-        "## Targets\n\n" + table(["what", "target", "measured", "reached"], target_rows(evaluation))
+        "## Targets\n\n" + table(["what", "target", "measured", "reached"], target_rows(evaluation, runs))
         + "\n\n" + better_guesses(evaluation) + (f"\n\n{args.note}" if args.note else ""),
         "## How the weights came about\n\n" + "\n".join(f"- {line}" for line in card.get("history", []))
         + f"\n- in all {card['steps']} steps in the last stage, {card['skipped_steps']} skipped",
         "## Depth\n\nAbsRel and Acc(1.25) after one median scale per image and per sequence. The guesses know the mean "
         "inverse depth of the training recordings with the same camera.\n\n"
         + table(DEPTH_HEADER, depth_rows(evaluation)),
+        "![Frames, true depth, predicted depth, error](../images/depth.png)\n\nThe first three recordings: frame, true "
+        "depth, prediction at the image's median scale (bright = near), relative error (white = 50 % and more).",
         "## Motion\n\nRotation: mean angle; direction: where the camera moves more than 0.5 mm; step after one scale "
         "per recording. \"Constant velocity\" is shown the TRUE step before.\n\n"
         + table(MOTION_HEADER, motion_rows(evaluation))
         + f"\n\nThe gyro alone, its bias of 0.5°/s (sd) left in: {evaluation.gyro_alone_deg:.2f}° per step.",
         "## By camera\n\n" + table(["camera", "AbsRel, image", "best guess", "rotation", "direction", "NEES"],
                                    by_camera(measured, cameras, maps, weights)),
-        "## Covariances\n\nSignals chosen on the calibration recordings: "
+        "## Covariances\n\nNEES is at each recording's own true scale; the scale prior answers for the rest.\n\n"
+        "Signals chosen on the calibration recordings: "
         f"{', '.join(model.signals) or 'none'}. Median sd over the held-out pairs: rotation "
         f"{np.degrees(np.median(spread[:, :3])):.2f}°, translation {np.median(spread[:, 3:]):.3f} units of "
         f"{1e3 * np.exp(card['scale_log_mean']):.1f} mm. The scale prior's sd is {card['scale_log_sd']:.2f}; held out, "

@@ -39,6 +39,13 @@ def sequences(part: str, count: int, first_seed: int, duration_s: float) -> Iter
                        duration_s, camera, SIZE)
 
 
+def plan(train: int = 36, calibration: int = 9, held_out: int = 9, seconds: float = 20.0) -> tuple[Sequence, ...]:
+    """All recordings of the three parts."""
+    return (*sequences("train", train, TRAIN_SEED, seconds),
+            *sequences("calibration", calibration, CALIBRATION_SEED, seconds),
+            *sequences("held-out", held_out, HELD_OUT_SEED, seconds))
+
+
 def main() -> None:
     """Render what is missing."""
     parser = argparse.ArgumentParser(description=__doc__)
@@ -50,10 +57,9 @@ def main() -> None:
     parser.add_argument("--workers", type=int, default=2)
     args = parser.parse_args()
     assert set(VIBRATIONS) == set(KINDS)
-    plan = (*sequences("train", args.train, TRAIN_SEED, args.seconds),
-            *sequences("calibration", args.calibration, CALIBRATION_SEED, args.seconds),
-            *sequences("held-out", args.held_out, HELD_OUT_SEED, args.seconds))
-    print(write_dataset(plan, args.data, args.workers, lambda done, total: print(f"{done} of {total}", flush=True)))
+    recordings = plan(args.train, args.calibration, args.held_out, args.seconds)
+    print(write_dataset(recordings, args.data, args.workers,
+                        lambda done, total: print(f"{done} of {total}", flush=True)))
 
 
 if __name__ == "__main__":
