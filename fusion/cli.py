@@ -1,5 +1,5 @@
-"""The command line: `capsule-vio demo | doctor | simulate | convert | inspect | predict | refine | compare |
-locate | report`.
+"""The command line: `capsule-vio demo | doctor | simulate | convert | inspect | train | evaluate | predict | refine |
+compare | locate | report`.
 
 Exit codes: 0 done; 2 wrong usage; 3 the input cannot be used; 4 no estimator produced a trajectory;
 1 a bug (traceback). Heavy libraries load only in the command that needs them.
@@ -25,8 +25,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     arguments = build_parser().parse_args(argv)
     commands: dict[str, Callable[[argparse.Namespace], int]] = {
         "demo": _demo, "doctor": _doctor, "simulate": _simulate, "convert": _convert, "inspect": _inspect,
-        "predict": _predict, "refine": _refine, "compare": _compare, "locate": _locate,
-        "report": _report,
+        "train": _train, "evaluate": _evaluate, "predict": _predict, "refine": _refine, "compare": _compare,
+        "locate": _locate, "report": _report,
     }
     try:
         return commands[arguments.command](arguments)
@@ -176,6 +176,32 @@ def _inspect(arguments: argparse.Namespace) -> int:
     return 3
 
 
+def _train(arguments: argparse.Namespace) -> int:
+    from learned.train_command import run_training
+    from vio.formats import open_recording
+
+    recordings, others = ([open_recording(path) for path in paths]
+                          for paths in (arguments.recordings, arguments.calibrate))
+    with _Progress() as progress:
+        trained = run_training(recordings, others, vars(arguments), progress.count)
+    print(trained)
+    return 0
+
+
+def _evaluate(arguments: argparse.Namespace) -> int:
+    from learned.report import evaluate, format_evaluation
+    from learned.weights import load_weights
+    from vio.formats import open_recording
+
+    weights = load_weights(arguments.weights)
+    evaluation = evaluate([open_recording(path) for path in arguments.recordings], weights)
+    if arguments.json:
+        _print_json(evaluation.to_dict())
+    else:
+        print(format_evaluation(evaluation))
+    return 0
+
+
 def _predict(arguments: argparse.Namespace) -> int:
     from vio.formats import open_recording
 
@@ -188,7 +214,8 @@ def _predict(arguments: argparse.Namespace) -> int:
         import learned
 
         with _Progress() as progress:
-            motions = learned.predict(recording, arguments.weights, depth_dir=arguments.depth, progress=progress.count)
+            motions = learned.predict(recording, arguments.weights, rotation=arguments.rotation,
+                                      depth_dir=arguments.depth, progress=progress.count)
     motions.save(arguments.out)
     print(f"{arguments.out}: {len(motions)} motions")
     return 0

@@ -15,6 +15,8 @@ DRIVING = ("natural", "operated", "brisk", "transit")
 CAMERAS = ("mirocam", "fisheye-140", "fisheye-156", "pinhole-110")
 PRODUCTS = ("normals", "albedo", "mask", "flow")
 DATASETS = ("mm-wce",)
+METHODS = ("gyro-correlation", "endosfmlearner", "af-sfmlearner", "ra-depth", "endodac")
+FUSIONS = ("fourier", "concatenation", "summation", "gated", "aff", "iaff", "butd")
 
 
 def build_parser() -> argparse.ArgumentParser:
@@ -25,7 +27,7 @@ def build_parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("--version", action="version", version=f"%(prog)s {_version()}")
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
-    for add in (_demo, _doctor, _simulate, _convert, _inspect, _predict, _refine, _compare, _locate,
+    for add in (_demo, _doctor, _simulate, _convert, _inspect, _train, _evaluate, _predict, _refine, _compare, _locate,
                 _report):
         add(commands)
     return parser
@@ -111,13 +113,46 @@ def _inspect(commands: Commands) -> None:
     _json(parser)
 
 
+def _train(commands: Commands) -> None:
+    parser = _command(commands, "train", "train a network on recordings, without truth; goes on where it was stopped",
+                      "train REC1 REC2 --calibrate REC3 --steps 4000 --out RUN")
+    parser.add_argument("recordings", type=Path, nargs="+", metavar="REC")
+    parser.add_argument("--method", choices=METHODS, default="gyro-correlation")
+    parser.add_argument("--vision-only", action="store_true", help="without the vibration branch")
+    parser.add_argument("--fusion", choices=FUSIONS, help="how vibration enters; default: fourier")
+    parser.add_argument("--width", type=float, default=1.0, help="factor on the networks' channels")
+    parser.add_argument("--image-size", type=int, nargs=2, metavar=("H", "W"), help="default: the method's")
+    parser.add_argument("--loss", choices=("native", "paper"), default="native", help="the method's or the paper's")
+    parser.add_argument("--steps", type=int, metavar="N")
+    parser.add_argument("--batch-size", type=int, metavar="N", help="triplets per process")
+    parser.add_argument("--seed", type=int, metavar="N")
+    parser.add_argument("--workers", type=int, metavar="N", help="processes that load data")
+    parser.add_argument("--patience", type=int, metavar="N", help="stop after N validations without a better loss")
+    parser.add_argument("--device", choices=("cpu", "cuda"), help="default: cuda where there is one")
+    parser.add_argument("--config", type=Path, metavar="c.yaml", help="any decision of `learned.train_config`")
+    parser.add_argument("--calibrate", type=Path, nargs="+", default=[], metavar="REC",
+                        help="recordings with truth to calibrate covariances and scale on; default: the validation "
+                             "split of those trained on, where they have truth")
+    parser.add_argument("--out", type=Path, required=True, metavar="RUN")
+
+
+def _evaluate(commands: Commands) -> None:
+    parser = _command(commands, "evaluate", "judge weights on recordings with truth, beside guesses without a network",
+                      "evaluate REC1 REC2 --weights RUN/weights.safetensors")
+    parser.add_argument("recordings", type=Path, nargs="+", metavar="REC")
+    parser.add_argument("--weights", type=Path, metavar="W", help="default: those that come with the library")
+    _json(parser)
+
+
 def _predict(commands: Commands) -> None:
     parser = _command(commands, "predict", "measure relative motions on a recording's images",
                       "predict REC --method classical --out motions.npz")
     parser.add_argument("recording", type=Path, metavar="REC")
     parser.add_argument("--method", choices=("learned", "classical"), default="learned",
                         help="a trained network, or KLT tracks with essential matrix and PnP")
-    parser.add_argument("--weights", type=Path, metavar="W")
+    parser.add_argument("--weights", type=Path, metavar="W", help="default: those that come with the library")
+    parser.add_argument("--rotation", choices=("network", "gyro"), default="network",
+                        help="gyro: correct the rotation by the gyro; for use without `refine`, which does so itself")
     parser.add_argument("--depth", type=Path, metavar="DIR", help="also write the predicted depth maps")
     parser.add_argument("--out", type=Path, required=True, metavar="motions.npz")
 

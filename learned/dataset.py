@@ -177,6 +177,11 @@ class TripletDataset(Dataset[Triplet]):
             torch.from_numpy(np.diff(source.recording.frame_t_s[index])).float(), int(self._rows[number, 0]),
             (int(index[0]), int(index[1]), int(index[2])))
 
+    def windows(self, number: int) -> Tensor:
+        """Vibration windows (3, 6, n) float32 of item `number`, as recorded: what a normalisation is fitted to."""
+        source, index = self._at(number)
+        return torch.from_numpy(source.vibration(index)).float().transpose(1, 2).contiguous()
+
     def symmetry(self, number: int) -> Symmetry:
         """How item `number` is shown in this epoch."""
         if not self.augment:

@@ -13,3 +13,11 @@ class PredictionError(VioError):
 
 class NetworkInputError(VioError):
     """Frames or vibration that a network cannot take: wrong shape, wrong size, missing."""
+
+
+class CheckpointError(VioError):
+    """A checkpoint that is damaged, or of another run."""
+
+
+class TrainingError(VioError):
+    """Training that cannot go on: losses that are not finite, nothing to validate with."""

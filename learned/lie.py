@@ -31,6 +31,17 @@ def so3_exp(rotvec: Tensor) -> Tensor:
     return torch.eye(3, dtype=rotvec.dtype, device=rotvec.device) + sine * K + cosine * (K @ K)
 
 
+def rotation_from_euler_xyz(angles: Tensor) -> Tensor:
+    """Angles (..., 3) about x, y, z [rad] → R = Rx Ry Rz (..., 3, 3), the order of the SfMLearner family."""
+    (sx, sy, sz), (cx, cy, cz) = torch.sin(angles).unbind(-1), torch.cos(angles).unbind(-1)
+    zero, one = torch.zeros_like(sx), torch.ones_like(sx)
+    shape = (*angles.shape[:-1], 3, 3)
+    Rx = torch.stack([one, zero, zero, zero, cx, -sx, zero, sx, cx], -1).reshape(shape)
+    Ry = torch.stack([cy, zero, sy, zero, one, zero, -sy, zero, cy], -1).reshape(shape)
+    Rz = torch.stack([cz, -sz, zero, sz, cz, zero, zero, zero, one], -1).reshape(shape)
+    return Rx @ Ry @ Rz
+
+
 def so3_log(R: Tensor) -> Tensor:
     """Rotation vectors (..., 3) [rad] of rotation matrices (..., 3, 3) that turn by clearly less than pi.
 

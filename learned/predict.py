@@ -1,5 +1,8 @@
 """Recording → relative motions and depth maps: frames stream through a predictor in batches.
 
+    motions = learned.predict(recording)                          # with the weights that come with the library
+    motions = learned.predict(recording, "weights.safetensors")   # with others, or any `Predictor`
+
 The driver knows nothing of networks. It reads every frame once and in order, keeps only the frames
 that an open pair still needs, cuts the IMU windows, checks what comes back, and writes depth maps as
 they come: memory does not grow with the recording, except for the motions themselves.
@@ -14,16 +17,19 @@ from dataclasses import dataclass
 from importlib.metadata import PackageNotFoundError, version
 from itertools import islice
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal, get_args
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 
 from learned.depth_maps import DepthMaps, depth_folder
-from learned.errors import PredictionError, WeightsError
+from learned.errors import PredictionError
 from learned.frames import resized_rgb
+from learned.gyro_update import GyroRotations
+from learned.network_predictor import NetworkPredictor, predictor_for
 from learned.predictor import Predictor
+from learned.weights import load_weights
 from learned.windows import ImuWindows
 from vio.errors import ConfigError, RecordingError
 from vio.motions import RelativeMotions
@@ -31,6 +37,7 @@ from vio.recording import Recording
 
 Array = NDArray[np.float64]
 Progress = Callable[[int, int], None]
+Rotation = Literal["network", "gyro"]
 
 DEPTH_UNIT_M = 1e-5  # 0.01 mm per count reaches 655 mm, further than a capsule sees
 
@@ -73,6 +80,7 @@ def predict(
     predictor: Predictor | str | Path | None = None,
     *,
     batch_size: int = 8,
+    rotation: Rotation = "network",
     depth_dir: str | Path | None = None,
     depth_unit_m: float = DEPTH_UNIT_M,
     progress: Progress | None = None,
@@ -81,8 +89,10 @@ def predict(
 
     Args:
         recording: with images, and an IMU log if the predictor looks at it.
-        predictor: what to measure with; a path or None would mean shipped weights, which this version lacks.
+        predictor: what to measure with; a path = weights of `capsule-vio train`, None = those that come along.
         batch_size: pairs per call of the predictor; changes speed, not results.
+        rotation: "network": what the images say, for a graph that fuses the gyro itself; "gyro": corrected by the
+            integrated gyro, far better alone, but such motions must not meet the same gyro again (`meta` says so).
         depth_dir: where to write a depth map of every frame (layout: `learned.depth_maps`), metric at the
             prior scale. The last frames open no pair: they are shown twice and only their depth is kept.
         depth_unit_m: metres per count of the depth maps.
@@ -92,20 +102,24 @@ def predict(
         One motion per pair, ordered by the second frame, then by baseline.
 
     Raises:
-        WeightsError: no predictor was given.
-        RecordingError: frames without images, or too few frames.
+        WeightsError: weights that are missing, damaged, or a pickle.
+        CameraError: no camera, or one too far from those that the weights were trained on.
+        RecordingError: frames without images, too few frames, or an image that cannot be read, naming it.
         ImuError: the predictor needs an IMU log that is absent or does not cover the frames.
         PredictionError: the predictor's output breaks its contract, naming the frames.
+        ConfigError: an unknown `rotation`, or "gyro" without weights that know the gyro's error.
         OutputError: the depth maps cannot be written.
     """
-    if predictor is None or isinstance(predictor, (str, Path)):
-        raise WeightsError(_no_weights(predictor))
     if batch_size < 1:
         raise ConfigError(f"batch_size is {batch_size}, must be at least 1")
+    if predictor is None or isinstance(predictor, (str, Path)):
+        predictor = predictor_for(recording, load_weights(predictor))
     _check(recording, predictor)
+    gyro = _gyro(recording, predictor) if _wants_gyro(rotation) else None
     t = recording.frame_t_s
     windows = ImuWindows(recording.imu, recording.imu_t_s, t, predictor.imu_samples_per_item, predictor.imu_rate_hz)
-    meta: dict[str, Any] = {"source": "learned", "predictor": dict(predictor.card), "library_version": _version()}
+    meta: dict[str, Any] = {"source": "learned", "predictor": dict(predictor.card), "library_version": _version(),
+                            "rotation": rotation}
     total = sum(max(len(recording) - baseline, 0) for baseline in predictor.baselines)
     done: list[_Batch] = []
     with ExitStack() as stack:
@@ -123,21 +137,29 @@ def predict(
     if len(snr) not in (0, len(done)):
         raise PredictionError("predictor: snr comes with some batches and not with others; give it always or never")
     meta["imu_windows_over_gaps"] = int(windows.over_gap(t[i]).sum())
+    T, cov = np.concatenate([part.T_i_j for part in done]), np.concatenate([part.cov for part in done])
+    if gyro is not None:
+        T, cov, meta["pairs_without_gyro"] = gyro.correct(T, cov, i, j)
     return Prediction(
-        t_i_s=t[i], t_j_s=t[j],
-        T_i_j=np.concatenate([part.T_i_j for part in done]), cov=np.concatenate([part.cov for part in done]),
+        t_i_s=t[i], t_j_s=t[j], T_i_j=T, cov=cov,
         scale_log_mean=predictor.scale_log_mean, scale_log_sd=predictor.scale_log_sd,
         snr=np.concatenate(snr) if snr else None, meta=meta,
         depth=None if maps is None else maps.files,
     )
 
 
-def _no_weights(path: str | Path | None) -> str:
-    remedy = ("give motions of another network with `--motions`, measure classical ones with "
-              "`predict --method classical`, or pass a Predictor of your own to learned.predict")
-    if path is None:
-        return f"no trained weights ship with this version; {remedy}"
-    return f"weights {Path(path).name}: this version has no network to load them into, and ships none; {remedy}"
+def _wants_gyro(rotation: str) -> bool:
+    if rotation not in get_args(Rotation):
+        raise ConfigError(f"rotation {rotation!r} is unknown; use one of {', '.join(get_args(Rotation))}")
+    return rotation == "gyro"
+
+
+def _gyro(recording: Recording, predictor: Predictor) -> GyroRotations:
+    sd = predictor.weights.card.get("gyro_sd_rad") if isinstance(predictor, NetworkPredictor) else None
+    if sd is None:
+        raise ConfigError("rotation='gyro': only weights calibrated with an IMU know how wrong a gyro's rotation is; "
+                          "use rotation='network'")
+    return GyroRotations(recording, float(sd))
 
 
 def _check(recording: Recording, predictor: Predictor) -> None:

@@ -242,11 +242,12 @@ def test_an_unwritable_output_exits_3(made, tmp_path, capsys):
     assert "cannot write" in one_line(capsys)
 
 
-def test_prediction_without_weights_says_so(made, tmp_path, capsys):
-    assert main(["predict", str(made / "REC"), "--out", str(tmp_path / "m.npz")]) == 3
-    assert "weights" in one_line(capsys)
-    assert main(["predict", str(made / "REC"), "--method", "classical", "--out", str(tmp_path / "m.npz")]) == 3
-    assert "image" in one_line(capsys)
+def test_prediction_without_images_says_so(made, tmp_path, capsys):
+    for options in ([], ["--method", "classical"]):
+        assert main(["predict", str(made / "REC"), *options, "--out", str(tmp_path / "m.npz")]) == 3
+        assert "image" in one_line(capsys)
+    assert main(["predict", str(made / "REC"), "--weights", "no.safetensors", "--out", str(tmp_path / "m.npz")]) == 3
+    assert "weights no.safetensors" in one_line(capsys)
     assert not (tmp_path / "m.npz").exists()
 
 

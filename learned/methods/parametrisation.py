@@ -7,10 +7,10 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from learned.networks.rigid_motion import inverse_rigid, rigid, rotation_from_euler_xyz, rotation_from_vector
+from learned.lie import inverse, rotation_from_euler_xyz, so3_exp, transform
 from vio.errors import ConfigError
 
-ROTATIONS = {"euler_xyz": rotation_from_euler_xyz, "vector": rotation_from_vector}
+ROTATIONS = {"euler_xyz": rotation_from_euler_xyz, "vector": so3_exp}
 ORDERS = ("rotation_first", "translation_first")
 PAIR_ORDERS = ("i_then_j", "j_then_i", "temporal")
 
@@ -78,5 +78,5 @@ class PoseParametrisation:
         numbers = self.scale * (raw.float() if raw.dtype in (torch.float16, torch.bfloat16) else raw)
         first, second = numbers[:, :3], numbers[:, 3:]
         turn, shift = (first, second) if self.order == "rotation_first" else (second, first)
-        T = rigid(ROTATIONS[self.rotation](turn), shift)
-        return inverse_rigid(T) if self.pair_order == "temporal" and i < j else T
+        T = transform(ROTATIONS[self.rotation](turn), shift)
+        return inverse(T) if self.pair_order == "temporal" and i < j else T

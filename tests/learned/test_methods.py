@@ -75,7 +75,7 @@ def published(name, P_first, P_second):
     turn = Rotation.from_matrix(T[:3, :3])
     if name == "endosfmlearner":  # sees target, then reference
         return np.concatenate([T[:3, 3], turn.as_euler("XYZ")]) / 0.01
-    scale = {"ra-depth": 0.01, "gyro-correlation": 0.1}.get(name, 0.001)
+    scale = {"ra-depth": 0.01, "gyro-correlation": 0.01}.get(name, 0.001)
     return np.concatenate([turn.as_rotvec(), T[:3, 3]]) / scale
 
 

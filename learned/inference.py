@@ -1,0 +1,94 @@
+"""What a trained method says about pairs of frames, and the signals that tell how far to trust it.
+
+The network looks at every pair in both orders; the motion is the mean of the two, and how far they are apart is one of
+the signals. No truth and no gyro rotation enters.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from learned.camera_rays import CameraBatch
+from learned.lie import inverse, so3_exp, so3_log, transform
+from learned.losses.photometric import Photometric, compare
+from learned.losses.terms import masked_mean
+from learned.methods import Method
+from learned.warping import WHOLE, DepthKind, project_depth, sample, to_z_depth
+
+SIGNALS = ("photometric", "unwarped", "length", "rotation", "order", "order_rotation", "depth", "snr")
+"""Names of the signals, all as natural logarithms: photometric residual of the warp, difference of the unmoved images,
+step length over median depth, rotation angle, distance between the two orders' translations over their length, and of
+their rotations, median depth, mean SNR (0 without one)."""
+LEAST = 1e-4
+
+
+@dataclass(frozen=True)
+class PairEstimate:
+    """B pairs."""
+
+    T_i_j: Tensor
+    """(B, 4, 4) pose of camera j in camera i, motion units."""
+    z_depth_i: Tensor
+    """(B, 1, H, W) z-depth of frame i in motion units, 0 where the camera sees nothing."""
+    snr: Tensor | None
+    """(B,) geometric mean of the SNR over the blocks of both networks; None without vibration."""
+    signals: Tensor
+    """(B, 8) the `SIGNALS`."""
+
+
+@torch.no_grad()
+def estimate_pairs(method: Method, frames: Tensor, vibration: Tensor | None, cameras: CameraBatch,
+                   depth_kind: DepthKind) -> PairEstimate:
+    """Measure pairs of frames.
+
+    Args:
+        method: in eval mode.
+        frames: (B, 2, 3, H, W) in 0..1, the earlier frame first.
+        vibration: (B, 6, n) windows centred at the earlier frames; None for a vision-only method.
+        cameras: B cameras of images of that size.
+        depth_kind: what the depth network's numbers mean.
+    """
+    out = method(frames, vibration, depth_frames=(0,), pairs=((0, 1), (1, 0)))
+    depth = out.depth[0].depth[0].float()
+    there, back = out.T_i_j[0, 1].float(), inverse(out.T_i_j[1, 0].float())
+    T = _mean(there, back)
+    snr = None
+    if out.snr_depth:
+        every = torch.cat([out.snr_depth[0], out.snr_pose[0, 1]], 1).float()
+        snr = every.clamp(min=LEAST).log().mean(1).exp()
+    z = to_z_depth(depth, cameras, depth_kind)
+    signals = _signals(frames, depth, T, there, back, snr, cameras, depth_kind)
+    return PairEstimate(T, z, snr, signals)
+
+
+def _mean(a: Tensor, b: Tensor) -> Tensor:
+    """Half-way between rigid motions (B, 4, 4): rotation along the geodesic, translation along the line."""
+    half = so3_exp(0.5 * so3_log(a[:, :3, :3].transpose(1, 2) @ b[:, :3, :3]))
+    return transform(a[:, :3, :3] @ half, 0.5 * (a[:, :3, 3] + b[:, :3, 3]))
+
+
+def _signals(frames: Tensor, depth: Tensor, T: Tensor, there: Tensor, back: Tensor, snr: Tensor | None,
+             cameras: CameraBatch, depth_kind: DepthKind) -> Tensor:
+    grey = frames.mean(2, keepdim=True)
+    small = [F.avg_pool2d(grey[:, k], 2) for k in (0, 1)]
+    coarse = cameras.resized(cameras.width // 2, cameras.height // 2)
+    where = project_depth(1 / F.avg_pool2d(1 / depth, 2), T, coarse, depth_kind)
+    pixels = torch.where(where.valid, where.pixels, torch.zeros_like(where.pixels))
+    lit = [(image > 0.01).to(image.dtype) for image in small]
+    valid = where.valid & (lit[0] > 0) & (sample(lit[1], pixels) > WHOLE)
+    settings = Photometric()
+    warped, mask = compare(sample(small[1], pixels), small[0], valid, settings)
+    still = compare(small[1], small[0], valid, settings)[0]
+    residual, unwarped = (torch.stack([masked_mean(x[k:k + 1], mask[k:k + 1]) for k in range(len(x))])
+                          for x in (warped, still))
+    length, middle = T[:, :3, 3].norm(dim=1), depth.flatten(1).median(1).values
+    apart = (there[:, :3, 3] - back[:, :3, 3]).norm(dim=1)
+    turn = so3_log(there[:, :3, :3].transpose(1, 2) @ back[:, :3, :3]).norm(dim=1)
+    rotation = so3_log(T[:, :3, :3]).norm(dim=1)
+    rows = [residual, unwarped, length / middle, rotation, apart / (length + 10 * LEAST), turn, middle,
+            torch.ones_like(length) if snr is None else snr]
+    return torch.stack([row.clamp(min=LEAST).log() for row in rows], 1)
