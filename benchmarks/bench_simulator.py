@@ -96,8 +96,8 @@ def memory() -> str:
 
 
 def scaling() -> str:
-    """Wall time of four recordings in one and in two processes."""
-    plan = tuple(Sequence(f"{k}", "small-bowel", "gaussian", 2, "operated", k, 20.0, "mirocam", 320) for k in range(4))
+    """Wall time of four recordings of the paper's data set in one and in two processes."""
+    plan = tuple(Sequence(f"{k}", "small-bowel", "gaussian", 2, "operated", k, 60.0, "mirocam", 320) for k in range(4))
     seconds = []
     for workers in (1, 2):
         folder = Path(tempfile.mkdtemp())
@@ -105,7 +105,7 @@ def scaling() -> str:
         write_dataset(plan, folder, workers)
         seconds.append(time.perf_counter() - start)
         shutil.rmtree(folder)
-    return (f"Four recordings of 60 frames: {seconds[0]:.1f} s in one process, {seconds[1]:.1f} s in two "
+    return (f"Four recordings of 180 frames: {seconds[0]:.1f} s in one process, {seconds[1]:.1f} s in two "
             f"(×{seconds[0] / seconds[1]:.2f}).")
 
 

@@ -24,6 +24,7 @@ CAPSULE_RADIUS_M = 5.5e-3
 CAPSULE_HALF_AXIS_M = 7.5e-3  # half the distance between the centres of its two domes
 CLEARANCE_M = 0.15e-3  # fluid film between capsule and wall
 _TENT_ROWS, _TENT_COLUMNS = 3.0, 4.0  # how far the tissue around a contact is pulled along
+_TENT_REACH_ROWS = 12  # four standard deviations, where the filter ends
 _NEIGHBOUR_ROWS = 90
 _SLIDE_M = 3e-3  # times the contraction's amplitude: how far the wall slides along the lumen
 _ANGLE = np.arange(COLUMNS) / COLUMNS * TAU
@@ -159,14 +160,10 @@ def _larger_root(a: Array | np.float64, half_b: Array, c: Array) -> Array:
 def _give_way(state: WallState, T_world_body: Array) -> WallState:
     """Push the wall out of the capsule, and pull the tissue around along."""
     rear, front = capsule_axis(T_world_body)
-    middle = T_world_body[:3, 3]
-    reach = CAPSULE_HALF_AXIS_M + 2 * CAPSULE_RADIUS_M + state.radius_m.max(axis=1)
-    distance = np.linalg.norm(state.centre_m - middle, axis=1)
-    loop = np.abs(np.arange(len(distance)) - np.argmin(distance)) <= _NEIGHBOUR_ROWS  # not another loop of the gut
-    near = np.flatnonzero((distance < reach) & loop)
-    if not len(near):
+    met = np.flatnonzero(_meets_capsule(state, T_world_body))
+    if not len(met):
         return state
-    rows = slice(near[0], near[-1] + 1)
+    rows = slice(max(met[0] - _TENT_REACH_ROWS, 0), met[-1] + 1 + _TENT_REACH_ROWS)
     needed = exit_radius(state.centre_m[rows], state.across[rows], _ANGLE, rear, front, CAPSULE_RADIUS_M + CLEARANCE_M)
     push = np.clip(needed - state.radius_m[rows], 0.0, None)
     if not push.any():
@@ -175,6 +172,16 @@ def _give_way(state: WallState, T_world_body: Array) -> WallState:
     radius = state.radius_m.copy()
     radius[rows] += tent
     return WallState(state.first_row, state.centre_m, state.across, radius)
+
+
+def _meets_capsule(state: WallState, T_world_body: Array) -> NDArray[np.bool_]:
+    """Rows (k,) whose plane cuts the capsule, without those of another loop of the gut."""
+    along = np.cross(state.across[:, 0], state.across[:, 1])
+    offset = state.centre_m - T_world_body[:3, 3]
+    reach = CAPSULE_HALF_AXIS_M * np.abs(along @ T_world_body[:3, 0]) + CAPSULE_RADIUS_M + CLEARANCE_M
+    nearest = np.argmin(np.sum(offset * offset, axis=1))
+    same_loop = np.abs(np.arange(len(offset)) - nearest) <= _NEIGHBOUR_ROWS
+    return np.asarray((np.abs(np.sum(along * offset, axis=1)) < reach) & same_loop)
 
 
 def rows_between(wall: Wall, low_m: float, high_m: float) -> tuple[int, int]:

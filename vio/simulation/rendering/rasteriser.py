@@ -36,6 +36,7 @@ def wall_vertices(centre: Array, across: Array, radius: Array, R: Array, p: Arra
         R, p: (3, 3), (3,) pose of the camera in the world.
     """
     k, m = radius.shape
+    cos, sin = np.cos(2 * math.pi / m * np.arange(m)), np.sin(2 * math.pi / m * np.arange(m))
     for i in range(k):
         base = np.zeros(3)
         u = np.zeros(3)
@@ -46,9 +47,7 @@ def wall_vertices(centre: Array, across: Array, radius: Array, R: Array, p: Arra
                 u[c] += across[i, 0, w] * R[w, c]
                 v[c] += across[i, 1, w] * R[w, c]
         for j in range(m):
-            angle = 2 * math.pi * j / m
-            a = math.cos(angle) * radius[i, j]
-            b = math.sin(angle) * radius[i, j]
+            a, b = cos[j] * radius[i, j], sin[j] * radius[i, j]
             for c in range(3):
                 out[i, j, c] = base[c] + a * u[c] + b * v[c]
 

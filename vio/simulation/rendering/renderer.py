@@ -21,8 +21,8 @@ from vio.simulation.rendering.lens import Lens, make_lens
 from vio.simulation.rendering.motion_blur import MOST_POSES, blur
 from vio.simulation.rendering.rasteriser import CELL_COLUMNS, MISS, project_vertices, rasterise, wall_vertices
 from vio.simulation.rendering.sensor import Sensor, SensorSwitches
-from vio.simulation.rendering.shading import shade
-from vio.simulation.rendering.textures import Textures
+from vio.simulation.rendering.shading import Switches, shade
+from vio.simulation.rendering.textures import MARGIN_M, Textures
 from vio.simulation.scenario import Simulation
 from vio.simulation.wall import ROW_M
 from vio.simulation.wall_motion import WallState, rows_between
@@ -42,7 +42,6 @@ _BEHIND_RADII = 1.5  # rows whose centre is this many radii behind the lens cann
 _TURN_HIDES_RAD = 2.3  # a lumen that has bent this far is hidden by its own wall
 _EDGE_STEP = 0.04  # relative depth step between neighbours that makes an edge
 _MARGIN_ROWS = 3
-_TEXTURE_ROWS = 60  # rows by which textures may be shifted along the wall
 
 
 @dataclass(frozen=True)
@@ -131,8 +130,8 @@ class Renderer:
         self._fine_hits = _Hits(make_lens(camera.resized(2 * camera.width, 2 * camera.height), circle), 2)
         self._sensor = Sensor(camera, self.options.sensor, self.lens.sees)
         self._textures = Textures(self._anatomy)
-        self._switches = np.array([self.options.specular, self.options.subsurface, self.options.relief,
-                                   self.options.second_bounce], float)
+        self._switches = Switches(self.options.specular, self.options.subsurface, self.options.relief,
+                                  self.options.second_bounce)
 
     def render(self, t_s: float, frame: int, gain: float | None = None) -> Frame:
         """The frame exposed around an instant.
@@ -219,14 +218,12 @@ class Renderer:
     def _shaded(self, scene: _Scene, lens: Lens, distance: Array, row: Array, column: Array,
                 rays: Array) -> tuple[Field, Field, Field]:
         """Radiance, normals and albedo (n, 3) of hits (n,)."""
-        radiance, normal, albedo = (np.zeros((len(distance), 3), np.float32) for _ in range(3))
         organ, first = self._anatomy.organ, scene.state.first_row
         last = first + len(scene.maps)
-        window = self._textures.window((first - _TEXTURE_ROWS) * ROW_M, (last + _TEXTURE_ROWS) * ROW_M)
-        shade(distance, row, column, rays, float(lens.numbers[12]), first, scene.centre_step, scene.across,
-              scene.across_step, scene.state.radius_m, scene.maps, window.levels, window.first_m, organ.radius_m,
-              np.array(organ.look.albedo), LEDS_M, self._switches, radiance, normal, albedo)
-        return radiance, normal, albedo
+        window = self._textures.window(first * ROW_M - MARGIN_M, last * ROW_M + MARGIN_M)
+        return shade(distance, row, column, rays, float(lens.numbers[12]), first, scene.centre_step, scene.across,
+                     scene.across_step, scene.state.radius_m, scene.maps, window.levels, window.slots, window.first_m,
+                     organ.radius_m, np.array(organ.look.albedo), LEDS_M, self._switches)
 
     def _supersampled(self, scene: _Scene, radiance: Field, distance_m: Field) -> Field:
         """Radiance with four rays per pixel where the options ask for it; linear light is averaged."""

@@ -1,9 +1,7 @@
 """Fine texture of the mucosa on the unrolled wall: vessels, relief, the wet film with its bubbles.
 
-A texel holds eight numbers: optical density R, G, B; slopes of the tissue's relief along and around; slopes of the wet
-film along and around; foam. Textures are made in sections from the seed, each with its mip levels (halved by
-averaging), so that far walls neither flicker nor alias. Everything coarser than a few millimetres lives on the wall's
-own grid (`vio.simulation.wall`).
+Textures are made in sections from the seed (`texels.py` keeps them, with mip levels, so that far walls neither flicker
+nor alias). Everything coarser than a few millimetres lives on the wall's own grid (`vio.simulation.wall`).
 """
 
 from __future__ import annotations
@@ -16,28 +14,31 @@ from numpy.typing import NDArray
 
 from vio.simulation.anatomy import Anatomy
 from vio.simulation.noise_fields import BandNoise, Field, Recent
+from vio.simulation.rendering.texels import CHANNELS, LEVELS, SECTION, Texels, TexelStore, pack
 from vio.simulation.rendering.vessels import Branch, grow, paint
 from vio.simulation.wall import ROW_M, TAU
 
 TEXEL_M = ROW_M / 4
-LEVELS = 4
-CHANNELS = 8
-_SECTION = 1024  # texels along; a multiple of 2**LEVELS
-_SECTIONS_KEPT = 6  # a capsule that tumbles or goes to and fro needs its neighbours again
+MARGIN_M = 0.03
+"""By how much textures may be shifted along the wall."""
+_SPARE_SECTIONS = 2  # a capsule that tumbles or goes to and fro needs its neighbours again
 _DEEP_VESSELS_PER_M2 = 1400.0
 _HALO = 64
-_BLOOD = np.array([0.30, 1.0, 0.75], np.float32)
-_TISSUE = np.array([0.25, 0.8, 1.0], np.float32)
+_TINTS = np.array([[0.25, 0.8, 1.0], [0.30, 1.0, 0.75]], np.float32)
+"""Optical density R, G, B of tissue and of blood."""
 _FILM_MM = 0.09
 
 
 @dataclass(frozen=True)
 class TextureWindow:
-    """Textures of a stretch of wall: one array (rows, columns, 8) float32 per level."""
+    """Textures of a stretch of wall."""
 
     first_m: float
-    """Where along the wall texel row 0 begins."""
-    levels: tuple[Field, ...]
+    """Where along the wall its first texel row begins."""
+    slots: NDArray[np.int64]
+    """Where each of its sections lies in the levels, in sections."""
+    levels: tuple[Texels, ...]
+    """Of `TexelStore`."""
 
 
 class Textures:
@@ -59,27 +60,20 @@ class Textures:
         self._fine = BandNoise((*seed, 23), self.columns, fine, 0.35e-3, 1.6e-3, blocks_kept=2)
         grain = {"circular": (0.45e-3, 1.1e-3), "haustral": (0.9e-3, 2.2e-3), "rugae": (1.5e-3, 4e-3)}[organ.folds]
         self._grain = BandNoise((*seed, 24), self.columns, fine, *grain, blocks_kept=2)
-        self._sections: Recent[tuple[Field, ...]] = Recent(_SECTIONS_KEPT)
         self._trees: tuple[Recent[list[Branch]], Recent[list[Branch]]] = (Recent(4), Recent(4))
-        self._window: tuple[range, TextureWindow] | None = None
+        longest_m = 2 * organ.view_m + 2 * organ.radius_m + 2 * MARGIN_M
+        self._store = TexelStore(int(np.ceil(longest_m / (SECTION * TEXEL_M))) + 1 + _SPARE_SECTIONS, self.columns)
 
     def window(self, low_m: float, high_m: float) -> TextureWindow:
-        """Textures between two places along the wall [m]; kept until another stretch is asked for."""
-        wanted = range(int(np.floor(low_m / TEXEL_M / _SECTION)), int(np.floor(high_m / TEXEL_M / _SECTION)) + 1)
-        if self._window is None or not (self._window[0].start <= wanted.start and wanted.stop <= self._window[0].stop):
-            self._window = None  # frees the old one first
-            parts = [self._sections.get(k, self._section) for k in wanted]
-            levels = tuple(np.concatenate([part[level] for part in parts]) for level in range(LEVELS))
-            self._window = (wanted, TextureWindow(wanted.start * _SECTION * TEXEL_M, levels))
-        return self._window[1]
+        """Textures between two places along the wall [m], at most the organ's view and twice `MARGIN_M` apart."""
+        length_m = SECTION * TEXEL_M
+        wanted = range(int(np.floor(low_m / length_m)), int(np.floor(high_m / length_m)) + 1)
+        slots = self._store.slots(wanted, self._make)
+        return TextureWindow(wanted.start * length_m, slots, self._store.levels)
 
-    def _section(self, k: int) -> tuple[Field, ...]:
-        """Section k with its mip levels."""
-        return _mip_levels(self._make(k))
-
-    def _make(self, k: int) -> Field:
-        """Texels (_SECTION, columns, 8) of section k."""
-        first, rows = k * _SECTION - _HALO, _SECTION + 2 * _HALO
+    def _make(self, k: int) -> Texels:
+        """Texels (SECTION, columns, 8) of section k."""
+        first, rows = k * SECTION - _HALO, SECTION + 2 * _HALO
         look = self._organ.look
         mid, film = (self._coarse(noise, first, rows) for noise in (self._mid, self._film))
         fine, grain = self._fine.rows(first, first + rows), self._grain.rows(first, first + rows)
@@ -92,12 +86,9 @@ class Textures:
             share = 0.02 if self._organ.folds == "haustral" else 0.05
             relief_mm = look.relief_mm[0] * fine + look.relief_mm[1] * mid + share * grain
         film_mm, foam = self._bubbles(k, first, _FILM_MM * film)
-        texels = np.empty((rows, self.columns, CHANNELS), np.float32)
-        texels[..., :3] = tissue[..., None] * _TISSUE + blood[..., None] * _BLOOD
-        texels[..., 3], texels[..., 4] = _slopes(relief_mm)
-        texels[..., 5], texels[..., 6] = _slopes(film_mm)
-        texels[..., 7] = foam
-        return texels[_HALO:-_HALO]
+        texels = np.empty((SECTION, self.columns, CHANNELS), np.int16)
+        pack(tissue, blood, relief_mm, film_mm, foam, _TINTS, 1e3 * TEXEL_M, _HALO, texels)
+        return texels
 
     def _coarse(self, noise: BandNoise, first: int, rows: int) -> Field:
         """A field of a quarter of the resolution, interpolated."""
@@ -128,9 +119,9 @@ class Textures:
     def _grown(self, stream: int, section: int, per_m2: float) -> list[Branch]:
         """Trees that root in a section, in texels from the wall's beginning."""
         rng = np.random.default_rng([*self._seed, stream, section + 1_000_000])
-        area_m2 = _SECTION * TEXEL_M * TAU * self._organ.radius_m
-        grown = grow(rng, int(rng.poisson(per_m2 * area_m2)), _SECTION, self.columns, TEXEL_M)
-        return [(points + np.array([0.0, section * _SECTION]), width) for points, width in grown]
+        area_m2 = SECTION * TEXEL_M * TAU * self._organ.radius_m
+        grown = grow(rng, int(rng.poisson(per_m2 * area_m2)), SECTION, self.columns, TEXEL_M)
+        return [(points + np.array([0.0, section * SECTION]), width) for points, width in grown]
 
     def _bubbles(self, k: int, first: int, film_mm: Field) -> tuple[Field, Field]:
         """The film with patches of bubbles on it, and where they are."""
@@ -138,12 +129,12 @@ class Textures:
         around_texel_m = TAU * self._organ.radius_m / self.columns
         for section in (k - 1, k, k + 1):
             rng = np.random.default_rng([*self._seed, 27, section + 1_000_000])
-            for _ in range(int(rng.poisson(self._organ.look.foam * _SECTION * TEXEL_M))):
-                middle = rng.uniform(0, [_SECTION * TEXEL_M, TAU * self._organ.radius_m])
+            for _ in range(int(rng.poisson(self._organ.look.foam * SECTION * TEXEL_M))):
+                middle = rng.uniform(0, [SECTION * TEXEL_M, TAU * self._organ.radius_m])
                 count, spread = int(rng.integers(8, 60)), rng.uniform(1.5e-3, 5e-3)
                 places = middle + spread * rng.standard_normal((count, 2))
                 for place, radius in zip(places, 1e-3 * rng.uniform(0.25, 1.1, count) ** 1.5, strict=True):
-                    texel = (place[0] / TEXEL_M + section * _SECTION - first, place[1] / around_texel_m)
+                    texel = (place[0] / TEXEL_M + section * SECTION - first, place[1] / around_texel_m)
                     _stamp_bubble(film_mm, foam, texel, radius / TEXEL_M)
         return film_mm, foam
 
@@ -162,19 +153,3 @@ def _stamp_bubble(film_mm: Field, foam: Field, texel: tuple[float, float], radiu
     place = (slice(low, high), columns % film_mm.shape[1])
     film_mm[place] = np.maximum(film_mm[place], np.where(inside > 0, dome + 0.1, film_mm[place]))
     foam[place] = np.maximum(foam[place], np.where(inside > 0, np.float32(1.0), np.float32(0.0)))
-
-
-def _slopes(height_mm: Field) -> tuple[Field, Field]:
-    """Slopes along and around of a height; the columns close on themselves."""
-    along = np.gradient(height_mm, np.float32(1e3 * TEXEL_M), axis=0)
-    around = (np.roll(height_mm, -1, 1) - np.roll(height_mm, 1, 1)) / np.float32(2e3 * TEXEL_M)
-    return along, around
-
-
-def _mip_levels(texels: NDArray[np.float32]) -> tuple[Field, ...]:
-    """The texels and their averages over 2x2, 4x4 and 8x8."""
-    levels = [np.ascontiguousarray(texels)]
-    for _ in range(LEVELS - 1):
-        t = levels[-1]
-        levels.append(np.ascontiguousarray(0.25 * (t[::2, ::2] + t[1::2, ::2] + t[::2, 1::2] + t[1::2, 1::2])))
-    return tuple(levels)
