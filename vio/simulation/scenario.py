@@ -30,7 +30,7 @@ from vio.trajectory import Trajectory
 
 Array = NDArray[np.float64]
 
-SIMULATOR_VERSION = 2
+SIMULATOR_VERSION = 3
 START_T_NS = 10_000_000_000  # stamp of the first frame; the IMU starts a little before
 IMU_MARGIN_S = 0.25
 MIN_IMU_RATE_HZ = 5.0  # slower samples would reach beyond the span of the motion
