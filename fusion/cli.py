@@ -215,9 +215,12 @@ def _predict(arguments: argparse.Namespace) -> int:
 
         with _Progress() as progress:
             motions = learned.predict(recording, arguments.weights, rotation=arguments.rotation,
-                                      depth_dir=arguments.depth, progress=progress.count)
+                                      depth_dir=arguments.depth, progress=progress.count,
+                                      unfinished=arguments.out.with_name(f"{arguments.out.name}.unfinished"))
     motions.save(arguments.out)
-    print(f"{arguments.out}: {len(motions)} motions")
+    lost = motions.meta.get("unreadable_frames", {})
+    print(f"{arguments.out}: {len(motions)} motions"
+          + (f"; without frame {', '.join(lost)}: {next(iter(lost.values()))}" if lost else ""))
     return 0
 
 

@@ -55,13 +55,18 @@ class DepthMaps:
         if image.shape != shape:
             image = cv2.resize(image, (shape[1], shape[0]), interpolation=cv2.INTER_NEAREST).astype(np.uint16)
         name = f"{t_ns}.png"
-        (self.folder / "data" / name).write_bytes(cv2.imencode(".png", image)[1].tobytes())
+        (self.images / name).write_bytes(cv2.imencode(".png", image)[1].tobytes())
         self.names.append(name)
+
+    @property
+    def images(self) -> Path:
+        """Where the maps are written now."""
+        return self.folder / "data"
 
     @property
     def files(self) -> tuple[Path, ...]:
         """The maps, in the order of their frames."""
-        return tuple(self.target / "data" / name for name in self.names)
+        return tuple(self.target / "data" / name for name in sorted(self.names, key=_stamp))
 
 
 @contextmanager
@@ -80,8 +85,12 @@ def depth_folder(
         (folder / "data").mkdir()
         maps = DepthMaps(folder, Path(target), unit_m, metres_per_unit)
         yield maps
-        rows = ["#timestamp [ns],filename", *(f"{Path(name).stem},{name}" for name in maps.names)]
+        rows = ["#timestamp [ns],filename", *(f"{_stamp(name)},{name}" for name in sorted(maps.names, key=_stamp))]
         (folder / "data.csv").write_text("\n".join(rows) + "\n", encoding="utf-8")
         sensor = {"sensor_type": "depth", "depth_unit_m": float(unit_m)}
         (folder / "sensor.yaml").write_text(yaml.safe_dump(sensor, sort_keys=False), encoding="utf-8")
         (folder / MARKER).write_text(json.dumps(dict(meta), indent=2, sort_keys=True) + "\n", encoding="utf-8")
+
+
+def _stamp(name: str) -> int:
+    return int(Path(name).stem)

@@ -2,6 +2,7 @@
 
 import gc
 import json
+import sys
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -123,7 +124,7 @@ def test_every_frame_is_read_once_and_few_are_held(recording: Recording, tmp_pat
         seen.append((done, total, len(recording.provenance["reads"])))
     learned.predict(recording, predictor, batch_size=2, depth_dir=tmp_path / "depth", progress=progress)
     assert recording.provenance["reads"] == list(range(FRAMES))
-    total = (FRAMES - 1) + (FRAMES - 3)
+    total = (FRAMES - 1) + (FRAMES - 3) + 1  # the last frame's depth
     assert seen[-1][:2] == (total, total) and [done for done, _, _ in seen] == sorted(done for done, _, _ in seen)
     assert all(reads <= done // 2 + 4 for done, _, reads in seen[:-1])  # never reads ahead of the batch at work
     assert max(predictor.live) <= 2 * 2 + 3 + 1  # the batch's pairs, the widest baseline, the newest frame
@@ -160,10 +161,72 @@ def test_a_fault_midway_leaves_nothing(recording: Recording, tmp_path: Path) -> 
     assert list(out.iterdir()) == []
     with pytest.raises(learned.PredictionError, match="predicts no depth"):
         learned.predict(recording, BarShift(with_depth=False), depth_dir=out / "depth")
-    recording.frame_paths[9].write_bytes(b"")
-    with pytest.raises(RecordingError, match="frame 9"):
+    for path in recording.frame_paths[::2]:
+        path.write_bytes(b"")
+    with pytest.raises(RecordingError, match=r"no two frames to compare can be read; frame 0: .*00\.png"):
         learned.predict(recording, BarShift(), depth_dir=out / "depth")
     assert list(out.iterdir()) == []
+
+
+def test_a_damaged_frame_loses_its_motions_and_nothing_stands_in_for_it(recording: Recording, tmp_path: Path) -> None:
+    whole = learned.predict(recording, BarShift(baselines=(1, 2)), depth_dir=tmp_path / "whole")
+    content = recording.frame_paths[6].read_bytes()
+    recording.frame_paths[6].write_bytes(content[: len(content) // 2])
+    motions = learned.predict(recording, BarShift(baselines=(1, 2)), depth_dir=tmp_path / "depth")
+    t = recording.frame_t_s
+    kept = (whole.t_i_s != t[6]) & (whole.t_j_s != t[6])
+    np.testing.assert_array_equal(motions.t_i_s, whole.t_i_s[kept])
+    np.testing.assert_array_equal(motions.T_i_j, whole.T_i_j[kept])
+    assert list(motions.meta["unreadable_frames"]) == ["6"]
+    assert "06.png is cut off" in motions.meta["unreadable_frames"]["6"]
+    for k, (ours, theirs) in enumerate(zip(motions.depth, whole.depth, strict=True)):
+        image = cv2.imread(str(ours), cv2.IMREAD_UNCHANGED)
+        assert ours.name == theirs.name and image.shape == (HEIGHT, WIDTH)
+        assert (image == 0).all() if k == 6 else (ours.read_bytes() == theirs.read_bytes())
+
+
+@pytest.mark.parametrize("stopped_at", [0, 5, 9])
+def test_a_stopped_prediction_goes_on_to_the_same_bytes(recording: Recording, tmp_path: Path, monkeypatch,
+                                                        stopped_at: int) -> None:
+    monkeypatch.setattr(sys.modules["learned.predict"], "PAIRS_KEPT", 4)
+    recording.frame_paths[3].write_bytes(b"")
+
+    def predicted(name: str, predictor: BarShift) -> learned.Prediction:
+        return learned.predict(recording, predictor, batch_size=2, depth_dir=tmp_path / name,
+                               unfinished=tmp_path / "unfinished")
+
+    whole = predicted("whole", BarShift())
+    assert not (tmp_path / "unfinished").exists()
+    with pytest.raises(learned.PredictionError, match="not finite"):
+        predicted("depth", BarShift(break_at=stopped_at))
+    recording.provenance.clear()
+    second = BarShift()
+    again = predicted("depth", second)
+    assert sum(second.calls) <= FRAMES - 1 - max(0, stopped_at - 4)  # what was kept is not measured again
+    for name in ("T_i_j", "cov", "t_i_s", "snr"):
+        np.testing.assert_array_equal(getattr(again, name), getattr(whole, name))
+    assert again.meta == whole.meta
+    assert [f.read_bytes() for f in again.depth] == [f.read_bytes() for f in whole.depth]
+    assert (tmp_path / "depth" / "data.csv").read_text() == (tmp_path / "whole" / "data.csv").read_text()
+    assert not (tmp_path / "unfinished").exists()
+
+
+def test_another_question_is_not_answered_from_what_was_kept(recording: Recording, tmp_path: Path,
+                                                             monkeypatch) -> None:
+    monkeypatch.setattr(sys.modules["learned.predict"], "PAIRS_KEPT", 2)
+    unfinished = tmp_path / "unfinished"
+    with pytest.raises(learned.PredictionError):
+        learned.predict(recording, BarShift(break_at=7), batch_size=2, unfinished=unfinished)
+    assert len(list(unfinished.glob("*.npz"))) == 3
+    other = BarShift(card={"method": "another"})
+    assert len(learned.predict(recording, other, batch_size=2, unfinished=unfinished)) == sum(other.calls)
+    stranger = tmp_path / "stranger"
+    stranger.mkdir()
+    (stranger / "thesis.txt").write_text("mine")
+    with pytest.raises(OutputError, match="move it"):
+        learned.predict(recording, BarShift(), unfinished=stranger)
+    assert (stranger / "thesis.txt").read_text() == "mine"
+
 
 
 def test_depth_of_the_recording_itself_is_never_replaced(recording: Recording, tmp_path: Path) -> None:

@@ -167,10 +167,10 @@ def test_recordings_that_do_not_fit_are_refused_by_name(file, ball, tmp_path):
         learned.predict(of(replace(CAMERA, fx=60)), file)
     with pytest.raises(CameraError, match="no camera is calibrated"):
         learned.predict(replace(ball, calibration=replace(ball.calibration, camera=None)), file)
-    broken = list(ball.frame_paths)
-    broken[4] = tmp_path / "4.png"
-    broken[4].write_bytes(ball.frame_paths[4].read_bytes()[:300])
-    with pytest.raises(RecordingError, match="frame 4"):
+    broken = [tmp_path / f"{k}.png" for k in range(len(ball))]
+    for path, whole in zip(broken, ball.frame_paths, strict=True):
+        path.write_bytes(whole.read_bytes()[:300])
+    with pytest.raises(RecordingError, match="no two frames to compare can be read; frame 0"):
         learned.predict(replace(ball, frame_paths=tuple(broken)), file)
     save_weights(tmp_path / "raw.safetensors", small(), CARD)
     with pytest.raises(WeightsError, match="never calibrated"):
