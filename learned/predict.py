@@ -74,7 +74,8 @@ def predict(
     Args:
         recording: with images, and an IMU log if the predictor looks at it.
         predictor: what to measure with; a path = weights of `capsule-vio train`, None = those that come along.
-        batch_size: pairs per call of the predictor; changes speed, not results.
+        batch_size: pairs per call of the predictor; changes speed, not results. A batch that the accelerator's memory
+            does not hold is halved, and `meta` says what fitted (`batch_size_that_fitted`).
         rotation: "network": what the images say, for a graph that fuses the gyro itself; "gyro": corrected by the
             integrated gyro, far better alone, but such motions must not meet the same gyro again (`meta` says so).
         depth_dir: where to write a depth map of every frame (layout: `learned.depth_maps`), metric at the
@@ -118,6 +119,8 @@ def predict(
         i, j, T, cov, snr = _joined(run.done, recording, run.unreadable)
     meta["imu_windows_over_gaps"] = int(run.windows.over_gap(t[i]).sum())
     meta["unreadable_frames"] = {str(k): reason for k, reason in sorted(run.unreadable.items())}
+    if run.smallest_batch < batch_size:
+        meta["batch_size_that_fitted"] = run.smallest_batch
     if gyro is not None:
         T, cov, meta["pairs_without_gyro"] = gyro.correct(T, cov, i, j)
     prediction = Prediction(
@@ -146,6 +149,7 @@ class _Run:
     def __post_init__(self) -> None:
         self.windows = ImuWindows(self.recording.imu, self.recording.imu_t_s, self.recording.frame_t_s,
                                   self.predictor.imu_samples_per_item, self.predictor.imu_rate_hz)
+        self.smallest_batch = self.batch_size
         self.reader = FrameReader(self.recording, self.predictor.image_size, max(self.predictor.baselines) + 1)
 
     def measure(self) -> None:
@@ -175,11 +179,13 @@ class _Run:
 
     def _measure_part(self, pairs: list[Pair], passed: int, total: int) -> None:
         measured: list[MeasuredPairs] = []
+        shown = passed
         maps_before = 0 if self.maps is None else len(self.maps.names)
         for batch in _batches(self.reader.shown(pairs), self.batch_size):
-            measured.append(_predict_batch(self.recording, self.predictor, self.windows, batch, self.maps))
+            measured += self._fitting(batch)
+            shown += len(batch)
             if self.progress is not None:
-                self.progress(min(passed + self.batch_size * len(measured), total), total)
+                self.progress(shown, total)
         self.done += measured
         unreadable = {k: reason for k, reason in self.reader.unreadable.items() if k not in self.unreadable}
         self.unreadable |= unreadable
@@ -187,6 +193,20 @@ class _Run:
             names = [] if self.maps is None else self.maps.names[maps_before:]
             self.unfinished.keep(Part(len(pairs), measured, unreadable, names),
                                  None if self.maps is None else self.maps.images)
+
+
+    def _fitting(self, batch: list[Shown]) -> list[MeasuredPairs]:
+        """One batch, in halves where the accelerator's memory does not hold it."""
+        try:
+            return [_predict_batch(self.recording, self.predictor, self.windows, batch, self.maps)]
+        except torch.OutOfMemoryError:
+            if len(batch) == 1:
+                raise PredictionError("predictor: one pair of frames does not fit the accelerator's memory; use the "
+                                      "CPU (CUDA_VISIBLE_DEVICES=) or smaller weights") from None
+        torch.cuda.empty_cache()
+        middle = len(batch) // 2
+        self.smallest_batch = min(self.smallest_batch, middle)
+        return [*self._fitting(batch[:middle]), *self._fitting(batch[middle:])]
 
 
 def _batches(items: Iterator[Shown], size: int) -> Iterator[list[Shown]]:

@@ -185,6 +185,25 @@ def test_a_damaged_frame_loses_its_motions_and_nothing_stands_in_for_it(recordin
         assert (image == 0).all() if k == 6 else (ours.read_bytes() == theirs.read_bytes())
 
 
+def test_a_batch_too_large_for_the_accelerator_is_halved_and_said(recording: Recording, tmp_path: Path) -> None:
+    class Small(BarShift):
+        most: int = 2
+
+        def predict(self, frames_i, frames_j, imu_windows):
+            if len(frames_i) > self.most:
+                raise torch.OutOfMemoryError("CUDA out of memory")
+            return super().predict(frames_i, frames_j, imu_windows)
+
+    whole = learned.predict(recording, BarShift(), batch_size=8)
+    halved = learned.predict(recording, Small(), batch_size=8, depth_dir=tmp_path / "depth")
+    np.testing.assert_array_equal(halved.T_i_j, whole.T_i_j)
+    assert halved.meta["batch_size_that_fitted"] in (1, 2) and len(halved.depth) == FRAMES
+    hopeless = Small()
+    hopeless.most = 0
+    with pytest.raises(learned.PredictionError, match="one pair of frames does not fit"):
+        learned.predict(recording, hopeless)
+
+
 @pytest.mark.parametrize("stopped_at", [0, 5, 9])
 def test_a_stopped_prediction_goes_on_to_the_same_bytes(recording: Recording, tmp_path: Path, monkeypatch,
                                                         stopped_at: int) -> None:
