@@ -71,7 +71,7 @@ def _print_json(value: Any) -> None:
 
 
 def _demo(arguments: argparse.Namespace) -> int:
-    from fusion.compare import format_table
+    from fusion.compare_text import format_table
     from fusion.demo import run_demo
 
     with _Progress() as progress:
@@ -255,7 +255,7 @@ def _refine(arguments: argparse.Namespace) -> int:
 
 
 def _sentences(summary: dict[str, Any]) -> str:
-    from fusion.compare import verdict
+    from fusion.compare_text import verdict
 
     scale, fallback = summary["scale"], summary["fallback_reason"]
     lines = [
@@ -270,9 +270,12 @@ def _sentences(summary: dict[str, Any]) -> str:
 
 
 def _compare(arguments: argparse.Namespace) -> int:
-    from fusion.compare import compare_paths, format_table
+    from fusion.compare_files import compare_paths, write_comparison
+    from fusion.compare_text import format_table
 
     comparison = compare_paths(arguments.runs, arguments.truth)
+    if arguments.out is not None:
+        write_comparison(comparison, arguments.out)
     if arguments.json:
         _print_json(comparison.to_dict())
     else:

@@ -175,6 +175,8 @@ def _compare(commands: Commands) -> None:
                       "compare RUN other.tum --truth truth.tum")
     parser.add_argument("runs", type=Path, nargs="+", metavar="RUN", help="run folder or TUM file")
     parser.add_argument("--truth", type=Path, metavar="traj.tum", help="default: the truth a run folder holds")
+    parser.add_argument("--out", type=Path, metavar="DIR",
+                        help="also write comparison.json, table.txt, and the compared frames as TUM files for evo")
     _json(parser)
 
 
