@@ -200,5 +200,7 @@ def _locate(commands: Commands) -> None:
 
 def _report(commands: Commands) -> None:
     parser = _command(commands, "report", "write a run's report.html again, with the lesions that locate placed",
-                      "report RUN")
+                      "report RUN --recording REC")
     parser.add_argument("run", type=Path, metavar="RUN", help="run folder that refine wrote")
+    parser.add_argument("--recording", type=Path, metavar="REC",
+                        help="the recording that was refined: pictures of the lesions")

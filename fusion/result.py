@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from fusion.joint import JointSamples
 from vio.camera import Camera
 from vio.imu import Gap
+from vio.inertial_levels import InertialLevels
 from vio.trajectory import Trajectory
 
 Array = NDArray[np.float64]
@@ -96,3 +97,5 @@ class Refinement:
     """How the errors of all poses hang together; None where that could not be sampled."""
     view: View | None = None
     """How the frames looked at the world; None when unknown."""
+    inertial: InertialLevels | None = None
+    """What the IMU felt along time; None when unknown."""

@@ -14,7 +14,7 @@ import numpy as np
 
 from fusion.config import RefineConfig
 from fusion.result import Refinement
-from fusion.run_states import joint_arrays, view_arrays
+from fusion.run_states import inertial_arrays, joint_arrays, view_arrays
 from fusion.summary import summarize
 from vio.atomic import atomic_folder
 from vio.errors import FormatError
@@ -103,6 +103,7 @@ def _write_states(r: Refinement, path: Path) -> None:
         path, t=r.trajectory.t_s, T_world_body=r.trajectory.T_world_body, cov=np.asarray(r.trajectory.cov),
         velocity=r.velocity_m_s, gyro_bias=r.gyro_bias_rad_s, accel_bias=r.accel_bias_m_s2, log_scale=r.log_scale,
         log_scale_sd=r.log_scale_sd, rejected=r.rejected, **joint_arrays(r.joint), **view_arrays(r.view),
+        **inertial_arrays(r.inertial),
     )
 
 

@@ -16,6 +16,7 @@ from fusion.lesions.course import Course
 from fusion.lesions.measures import arc_interval, capsule_along
 from fusion.report import figures
 from fusion.report.figures import Figure
+from fusion.report.sections import table
 from fusion.report.words import NBSP
 from fusion.result import Refinement
 
@@ -91,14 +92,12 @@ def space_marks(rows: Sequence[Row], T_scene_world: Array, factor: float) -> lis
 
 def lesion_table(rows: Sequence[Row]) -> str:
     """All lesions and landmarks as an HTML table; every text in it is escaped."""
-    body = "".join(_table_row(number, row) for number, row in enumerate(rows, 1))
-    head = "".join(f"<th>{name}</th>" for name in (
-        "No.", "What", "Frame", "Time", "Along the gut [mm]", "From the nearest landmark [mm]", "% of path",
-        "% of time", "sd in space [mm]"))
+    body = [_table_row(number, row) for number, row in enumerate(rows, 1)]
+    head = ("No.", "What", "% of path", "% of time", "From the nearest landmark [mm]", "Along the gut [mm]", "Frame",
+            "Time", "sd in space [mm]")
     return ('<section class="lesions"><h2>Lesions and landmarks</h2><p class="caption">Along the travelled centreline '
             "from the first frame; in brackets 95 % intervals. A negative distance lies before the landmark. "
-            f"Numbers as in the figures.</p><table><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table>"
-            "</section>")
+            f"Numbers as in the figures.</p>{table(head, body)}</section>")
 
 
 def _table_row(number: int, row: Row) -> str:
@@ -108,9 +107,9 @@ def _table_row(number: int, row: Row) -> str:
     if row["nearest_landmark"] is not None:
         away += f" {row['nearest_landmark']}"
     sd = f"{NBSP}×{NBSP}".join(_figure(row[f"sd_{axis}_mm"]) for axis in ("major", "mid", "minor"))
-    cells = [str(row["frame"]), _clock(float(row["timestamp_s"])),
-             _interval(row, "arc_length_mm", "arc_lo_mm", "arc_hi_mm"), away,
-             _interval(row, "percent_path", "percent_path_lo", "percent_path_hi"), _figure(row["percent_time"]), sd]
+    cells = [_interval(row, "percent_path", "percent_path_lo", "percent_path_hi"), _figure(row["percent_time"]), away,
+             _interval(row, "arc_length_mm", "arc_lo_mm", "arc_hi_mm"), str(row["frame"]),
+             _clock(float(row["timestamp_s"])), sd]
     label = escape(what) + (f" <small>{escape(named)}</small>" if named else "")
     remark = "" if row["status"] == "ok" else f'<div class="remark">{escape(row["status"])}</div>'
     return (f'<tr><th>{number}</th><td class="label">{label}{remark}</td>'
