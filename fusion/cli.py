@@ -164,7 +164,12 @@ def _inspect(arguments: argparse.Namespace) -> int:
     from vio.formats import open_recording
     from vio.inspection import format_inspection, inspect_recording
 
-    inspection = inspect_recording(open_recording(arguments.recording))
+    recording = open_recording(arguments.recording)
+    inspection = inspect_recording(recording, pixels=arguments.html is not None)
+    if arguments.html is not None:
+        from fusion.report.inspection_page import write_inspection
+
+        write_inspection(recording, inspection, arguments.html)
     if arguments.json:
         _print_json(inspection.to_dict())
     else:

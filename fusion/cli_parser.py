@@ -108,8 +108,11 @@ def _convert(commands: Commands) -> None:
 
 
 def _inspect(commands: Commands) -> None:
-    parser = _command(commands, "inspect", "say what a recording holds and whether it can be used", "inspect REC")
+    parser = _command(commands, "inspect", "say what a recording holds and whether it can be used",
+                      "inspect REC --html inspection.html")
     parser.add_argument("recording", type=Path, metavar="REC")
+    parser.add_argument("--html", type=Path, metavar="FILE", help="also look at the images, whether camera and gyro "
+                        "agree, and write a page with pictures of rates, holes, gravity and vibration")
     _json(parser)
 
 

@@ -1,7 +1,8 @@
 """What the IMU felt along time, in spans short enough to see events and few enough to draw.
 
-Vibration is what is left of the specific force after its mean over one second: slow turns under gravity and drifting
-biases are not vibration, tremor and bumps are.
+Vibration is what is left of the specific force after the parabola that fits it best over one second around (Savitzky
+and Golay, Analytical Chemistry 36, 1964): turns under gravity and drifting biases are not vibration, tremor and bumps
+are.
 """
 
 from __future__ import annotations
@@ -10,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.ndimage import uniform_filter1d
+from scipy.ndimage import convolve1d
 
 from vio.errors import ImuError
 from vio.imu import ImuSamples
@@ -19,7 +20,7 @@ Array = NDArray[np.float64]
 
 SHORTEST_SPAN_S, MOST_SPANS = 0.25, 2000
 SLOW_S = 1.0
-"""Length of the running mean that vibration is measured from."""
+"""Length of the running parabola that vibration is measured from."""
 
 
 @dataclass(frozen=True)
@@ -33,7 +34,7 @@ class InertialLevels:
     force_m_s2: Array
     """(B,) root mean square of the specific force."""
     vibration_m_s2: Array
-    """(B,) root mean square of the specific force less its mean over one second."""
+    """(B,) root mean square of the specific force less a running parabola over one second."""
 
     def __post_init__(self) -> None:
         shapes = {np.shape(getattr(self, name)) for name in ("t_s", "rate_rad_s", "force_m_s2", "vibration_m_s2")}
@@ -60,10 +61,13 @@ def inertial_levels(samples: ImuSamples, imu_t_s: ArrayLike) -> InertialLevels |
 
 
 def _slow(signal: Array, t: Array) -> Array:
-    """(N, 3) running mean over `SLOW_S`."""
-    period = float(np.median(np.diff(t)))
-    window = max(3, round(SLOW_S / max(period, 1e-9)) | 1)
-    return np.asarray(uniform_filter1d(signal, min(window, 2 * len(signal) - 1), axis=0, mode="reflect"))
+    """(N, 3) the parabola fitted around every sample, at that sample."""
+    period = max(float(np.median(np.diff(t))), 1e-9)
+    half = min(max(1, round(0.5 * SLOW_S / period)), len(t) - 1)
+    i = np.arange(-half, half + 1)
+    weight = 3 * (3 * half**2 + 3 * half - 1 - 5 * i**2) / ((2 * half + 3) * (2 * half + 1) * (2 * half - 1))
+    padded = np.pad(signal, ((half, half), (0, 0)), "reflect", reflect_type="odd")  # goes on with the same slope
+    return np.asarray(convolve1d(padded, weight, axis=0)[half:-half])
 
 
 def _rms(signal: Array, owner: NDArray[np.int64], count: int) -> Array:

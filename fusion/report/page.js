@@ -1,5 +1,6 @@
 "use strict";
 (() => {
+  performance.mark("script");
   const figures = JSON.parse(document.getElementById("figures").textContent);
   const config = {
     responsive: true, displaylogo: false, displayModeBar: innerWidth > 760 ? "hover" : false,
@@ -29,9 +30,9 @@
     if (timed.includes(key)) document.getElementById(key).on("plotly_relayout", (change) => follow(key, change));
   }
 
-  // One figure after the other, so that the page answers while it draws.
+  // One figure after the other, so that the page answers while it draws; those in space take longest and come last.
   async function drawAll() {
-    for (const key of keys) {
+    for (const key of [...timed, ...keys.filter((key) => !timed.includes(key))]) {
       if (!shown.has(key)) draw(key);
       await new Promise((next) => setTimeout(next));
     }

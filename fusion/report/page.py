@@ -114,7 +114,7 @@ def _figures(refinement: Refinement, scene: Scene,
                 figures.scale_figure(refinement, gaps)))
     if refinement.inertial is not None:
         out.append(("rate", "Turning", "What the gyro felt.", rate_figure(refinement.inertial, gaps)))
-        caption = "Specific force less its mean over one second: tremor, bumps, steps of the patient."
+        caption = "Specific force less its slow part: tremor, bumps, steps of the patient."
         out.append(("vibration", "Vibration", caption, vibration_figure(refinement.inertial, gaps)))
     for key, title, values, label in (
         ("gyro", "Gyro bias", refinement.gyro_bias_rad_s * 57.29577951308232, "bias [°/s]"),

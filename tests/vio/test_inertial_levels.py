@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from vio.errors import ImuError
@@ -14,17 +14,18 @@ def samples_of(t: np.ndarray, gyro: np.ndarray, accel: np.ndarray) -> ImuSamples
     return ImuSamples((t * 1e9).astype(np.int64), gyro, accel)
 
 
+@settings(max_examples=30)
 @given(amplitude=st.floats(0.01, 20), hz=st.floats(4, 18), seed=st.integers(0, 2**16))
 def test_a_shake_has_its_own_rms_and_slow_turns_have_none(amplitude, hz, seed):
-    t = np.arange(2000) / 40
+    t = np.arange(800) / 40
     direction = np.linalg.qr(np.random.default_rng(seed).normal(size=(3, 3)))[0][0]
     shake = amplitude * np.sin(2 * np.pi * hz * t)[:, None] * direction
-    slow = 9.81 * np.column_stack([np.sin(0.02 * t), np.zeros_like(t), np.cos(0.02 * t)])
-    levels = inertial_levels(samples_of(t, np.tile([0.3, 0.0, 0.4], (2000, 1)), slow + shake), t)
-    assert np.sqrt(np.mean(levels.vibration_m_s2[4:-4] ** 2)) == pytest.approx(amplitude / np.sqrt(2), rel=0.08)
+    slow = 9.81 * np.column_stack([np.sin(t), np.zeros_like(t), np.cos(t)])  # 57 deg/s
+    levels = inertial_levels(samples_of(t, np.tile([0.3, 0.0, 0.4], (800, 1)), slow + shake), t)
+    assert np.sqrt(np.mean(levels.vibration_m_s2[4:-4] ** 2)) == pytest.approx(amplitude / np.sqrt(2), rel=0.15)
     np.testing.assert_allclose(levels.rate_rad_s, 0.5)
-    still = inertial_levels(samples_of(t, np.zeros((2000, 3)), slow), t)
-    assert still.vibration_m_s2.max() < 0.06 and np.allclose(still.force_m_s2, 9.81)
+    still = inertial_levels(samples_of(t, np.zeros((800, 3)), slow), t)
+    assert still.vibration_m_s2.max() < 0.1 and np.allclose(still.force_m_s2, 9.81)
 
 
 @given(n=st.integers(2, 5000), hz=st.floats(0.5, 200), gap_s=st.floats(0, 50))
