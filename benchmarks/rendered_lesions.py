@@ -142,17 +142,17 @@ def shows(depth_of: Callable[[int], np.ndarray], frame: int, pixel: np.ndarray, 
 
 
 TEXT = """{duration:g} s at 3 Hz per recording, {seeds} seeds ({first}-{last}) that nothing was trained or chosen on, in
-colon and small bowel, driven ("operated"), rendered at {size} x {size} pixels through two cameras, with vibrations from
-none to collisions of level 5. Motions and depth are those of the bundled network; pixels are exact, truth comes from the
-rendered depth. Each lesion is a random spot of the wall or one of the simulator's marks, noted in up to five
+colon and small bowel, driven ("operated"), rendered at {size} x {size} pixels through two cameras, with vibrations
+from none to collisions of level 5. Motions and depth are those of the bundled network; pixels are exact, truth comes
+from the rendered depth. Each lesion is a random spot of the wall or one of the simulator's marks, noted in up to five
 neighbouring frames. "Motions alone" is the learned trajectory without IMU: the chain of the same motions at their prior
 scale, with the network's own covariances and the same depth. Intervals are at 95 %.
 
 {arcs}
 
 In space the refined places are {space:.1f} mm off in the median, and {ellipsoid} % lie in their 95 % ellipsoid. Refined
-is nearer along the gut than motions alone for {better:.0f} % of the lesions. Errors within one recording are correlated:
-{recordings} recordings are few.
+is nearer along the gut than motions alone for {better:.0f} % of the lesions. Errors within one recording are
+correlated: {recordings} recordings are few.
 
 {judgement}"""
 AIM = (90.0, 99.0)

@@ -31,11 +31,16 @@ def main(argv: Sequence[str] | None = None) -> int:
     try:
         return commands[arguments.command](arguments)
     except VioError as error:
-        print(f"capsule-vio {arguments.command}: {error}", file=sys.stderr)
+        print(f"capsule-vio {arguments.command}: {_one_line(error)}", file=sys.stderr)
         return error.exit_code
     except KeyboardInterrupt:
         print("interrupted; nothing half-written was kept", file=sys.stderr)
         return 130
+
+
+def _one_line(error: VioError) -> str:
+    """The message on one line, without what a terminal would take for a command (file names can hold anything)."""
+    return "".join(c if c.isprintable() or c == "\u00a0" else " " for c in str(error))
 
 
 class _Progress:
@@ -169,7 +174,7 @@ def _inspect(arguments: argparse.Namespace) -> int:
     if arguments.html is not None:
         from fusion.report.inspection_page import write_inspection
 
-        write_inspection(recording, inspection, arguments.html)
+        write_inspection(replace(recording, name=arguments.html.stem), inspection, arguments.html)
     if arguments.json:
         _print_json(inspection.to_dict())
     else:
@@ -249,7 +254,8 @@ def _refine(arguments: argparse.Namespace) -> int:
     inputs = {name: path for name, path in inputs.items() if path.is_file()}
     with _Progress() as progress:
         refined = refine(recording, motions, config, progress)
-    command = ["refine", arguments.recording.name, "--out", arguments.out.name]
+    # What people call their files may be a patient's name: a run is named after the folder it is written to.
+    refined, command = replace(refined, name=arguments.out.resolve().name), ["refine", "REC", "--out", "RUN"]
     summary = write_run(refined, arguments.out, Provenance(command, config, inputs), motions)
     if arguments.json:
         _print_json(summary)

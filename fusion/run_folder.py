@@ -34,7 +34,7 @@ class Provenance:
     """The command line, without folders: only the names of files."""
     config: RefineConfig
     inputs: dict[str, Path]
-    """Input files by role; only their names and SHA-256 are recorded."""
+    """Input files by role; only that and their SHA-256 are recorded: a file name may be a patient's."""
     seed: int | None = None
 
 
@@ -91,7 +91,7 @@ def read_run(folder: str | Path) -> Run:
     except OSError:
         raise FormatError(f"{folder.name}: no summary.json; give a folder written by `capsule-vio refine`") from None
     except ValueError as error:
-        raise FormatError(f"{folder.name}/summary.json: not valid JSON ({error})") from None
+        raise FormatError(f"{folder.name}/summary.json: not valid JSON ({error}); write the run again") from None
     if not isinstance(summary, dict) or summary.get("schema") != 1:
         raise FormatError(f"{folder.name}/summary.json: not a summary of schema 1; write the run again")
     refined, motions_only = read_tum(folder / "trajectory.tum"), read_tum(folder / "motions_only.tum")
@@ -119,7 +119,8 @@ def _manifest(provenance: Provenance) -> dict[str, Any]:
         "config": provenance.config.to_dict(),
         "seed": provenance.seed,
         "libraries": {name: _version(name) for name in LIBRARIES} | {"python": platform.python_version()},
-        "inputs": {role: {"name": path.name, "sha256": sha256_of(path)} for role, path in provenance.inputs.items()},
+        "inputs": {role: {"name": f"{role}{path.suffix}", "sha256": sha256_of(path)}
+                   for role, path in provenance.inputs.items()},
     }
 
 

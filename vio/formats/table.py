@@ -110,7 +110,8 @@ def parse_stamps(table: TextTable, error: type[VioError]) -> NDArray[np.int64]:
         try:
             stamps[k] = int(field)
         except (ValueError, OverflowError):
-            raise error(f"{table.at(k)}: stamp {field!r} is not a whole number of nanoseconds") from None
+            raise error(f"{table.at(k)}: stamp {field[:40]!r} is not a whole number of nanoseconds; separate columns "
+                        "by commas and write stamps without a point") from None
     return check_increasing(stamps, table, error)
 
 
