@@ -172,7 +172,8 @@ def check_quaternions(quaternions: Array, table: TextTable, error: type[VioError
     Raises:
         error: a length that is off by more than 1e-3, naming its line.
     """
-    length = np.linalg.norm(quaternions, axis=1)
+    with np.errstate(over="ignore"):  # infinite is not of unit length either
+        length = np.linalg.norm(quaternions, axis=1)
     bad = np.abs(length - 1) > QUATERNION_TOLERANCE
     if bad.any():
         row = int(np.argmax(bad))
