@@ -40,7 +40,7 @@ def as_somebody_has_it(recording: Recording, folder: Path) -> None:
 
 
 out = Path(sys.argv[1] if len(sys.argv) > 1 else "out/example_04")
-simulation = simulate("colon", "gaussian", 1, 12.0, seed=4, driving="operated", camera=preset_camera("fisheye-140", 96))
+simulation = simulate("colon", "gaussian", 1, 8.0, seed=4, driving="operated", camera=preset_camera("fisheye-140", 96))
 write_rendered(simulation, out / "simulated")
 as_somebody_has_it(vio.open_recording(out / "simulated"), out / "mine")
 
@@ -52,5 +52,5 @@ print(format_inspection(inspect_recording(recording, pixels=True)))
 
 motions = learned.predict(recording)  # the bundled weights; or vio.odometry.measure_recording(recording), no network
 refined = fusion.refine(recording, motions)
-print(f"{len(refined.trajectory)} poses by the {refined.estimator}; scale {refined.scale.policy}: {refined.scale.reason}")
+print(f"{len(refined.trajectory)} poses by the {refined.estimator}; {refined.scale.policy}: {refined.scale.reason}")
 vio.write_tum(refined.trajectory, out / "trajectory.tum")

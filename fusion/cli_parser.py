@@ -28,7 +28,7 @@ def build_parser() -> argparse.ArgumentParser:
     parser.add_argument("--version", action="version", version=f"%(prog)s {_version()}")
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
     for add in (_demo, _doctor, _simulate, _convert, _inspect, _train, _evaluate, _predict, _refine, _compare, _locate,
-                _report):
+                _report, _view):
         add(commands)
     return parser
 
@@ -207,3 +207,12 @@ def _report(commands: Commands) -> None:
     parser.add_argument("run", type=Path, metavar="RUN", help="run folder that refine wrote")
     parser.add_argument("--recording", type=Path, metavar="REC",
                         help="the recording that was refined: pictures of the lesions")
+
+
+def _view(commands: Commands) -> None:
+    parser = _command(commands, "view", "write a run for the rerun viewer: poses, frames, depth and lesions over time",
+                      "view RUN --recording REC --out run.rrd")
+    parser.add_argument("run", type=Path, metavar="RUN", help="run folder that refine wrote")
+    parser.add_argument("--recording", type=Path, metavar="REC", help="the recording that was refined: its frames")
+    parser.add_argument("--depth", type=Path, metavar="DIR", help="depth maps that predict --depth wrote")
+    parser.add_argument("--out", type=Path, required=True, metavar="FILE.rrd")
