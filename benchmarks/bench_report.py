@@ -199,8 +199,8 @@ openings.
 
 {table}
 
-A curve holds at most some 3000 points whatever the length, so the page hardly grows. Memory grows with the refinement
-itself, which is read as a whole, not with what is drawn."""
+A curve holds at most some 3000 points whatever the length, so the page hardly grows. Memory does grow, by some 2.8 kB
+a frame: poses and covariances are read and aligned as a whole. Constant memory, which was aimed at, this is not."""
 
 
 if __name__ == "__main__":
