@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import chi2
 
-from fusion.result import Refinement
+from fusion.result import Refinement, check_same_recording
 from vio import se3
 from vio.atomic import atomic_write
 from vio.camera import Camera
@@ -44,8 +44,10 @@ def write_rerun(refinement: Refinement, path: str | Path, *, recording: Recordin
 
     Raises:
         OutputError: rerun is not installed, or the file cannot be written.
-        RecordingError: an image of the recording is cut off or undecodable.
+        RecordingError: the recording is not the one that was refined, or one of its images is cut off or undecodable.
     """
+    if recording is not None:
+        check_same_recording(refinement, recording)
     rr = _rerun()
     stream = rr.RecordingStream("capsule-vio")
     memory = stream.memory_recording()

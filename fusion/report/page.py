@@ -17,7 +17,7 @@ from fusion.report.pictures import picture_gallery
 from fusion.report.plot import trajectory_svg
 from fusion.report.tube import tube_figure
 from fusion.report.unrolled import lesion_table, space_marks, unrolled_figure
-from fusion.result import Refinement
+from fusion.result import Refinement, check_same_recording
 from vio.atomic import atomic_write
 from vio.motions import RelativeMotions
 from vio.recording import Recording
@@ -45,9 +45,12 @@ def write_report(
 
     Raises:
         OutputError: the file cannot be written.
-        RecordingError: an image of the recording is cut off or undecodable.
+        RecordingError: the recording is not the one that was refined, or one of its images is cut off or undecodable.
     """
     from plotly.offline import get_plotlyjs  # heavy, and needed only once a page is written
+
+    if recording is not None:
+        check_same_recording(refinement, recording)
 
     page = Template(_asset("page.html")).substitute(
         _content(refinement, summary, make_scene(refinement, motions), lesions or (), recording),

@@ -13,12 +13,15 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from benchmarks.browser import Browser
-from fusion import Provenance, RefineConfig, locate, read_refinement, write_lesions, write_run
+from fusion import Provenance, RefineConfig, locate, read_refinement, read_run, write_lesions, write_run
 from fusion.cli import main
+from fusion.report import write_report
 from fusion.report.levels import spans_speed
 from fusion.report.pictures import MOST, picture_gallery
 from fusion.report.tube import RADIUS_SD, SIDES, ring_frames, tube
+from fusion.view import write_rerun
 from vio.calibration import Calibration
+from vio.errors import RecordingError
 from vio.imu import ImuSamples
 from vio.recording import Recording
 
@@ -201,3 +204,12 @@ def test_paper_is_light_complete_and_within_its_margins(tab, run):
     tab.emulate("dark")
     tab.ask("dispatchEvent(new Event('afterprint'))")
     assert tab.ask("getComputedStyle(document.querySelector('#vibration .js-line')).stroke") == "rgb(255, 111, 123)"
+
+
+def test_pictures_of_another_recording_are_refused(run, refined, tmp_path):
+    other = pictured(tmp_path, len(refined.trajectory))  # as many frames, at other times
+    for write in (lambda: write_report(refined, read_run(run).summary, tmp_path / "r.html", recording=other),
+                  lambda: write_rerun(refined, tmp_path / "r.rrd", recording=other)):
+        with pytest.raises(RecordingError, match=r"recording r does not have the frames .* give the recording that was"):
+            write()
+    assert not (tmp_path / "r.html").exists()
