@@ -20,7 +20,8 @@ from eqvio_tracks import CAMERA, FRAME_RATE_HZ, load_eqvio_tracks
 from results import record, table
 
 from fusion import RefineConfig, Refinement, refine
-from fusion.compare import compare, format_table
+from fusion.compare import compare
+from fusion.compare_text import format_table
 from vio import Recording, open_recording
 from vio.metrics import nees
 from vio.odometry import measure_motions

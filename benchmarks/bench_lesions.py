@@ -2,6 +2,7 @@
 
     python benchmarks/bench_lesions.py                  # colon and small bowel, three vibrations, 5 held-out seeds
     python benchmarks/bench_lesions.py --seeds 1 2 3 --scenes peristalsis:3
+    python benchmarks/bench_lesions.py --rendered       # through rendered frames and the bundled network
 """
 
 from __future__ import annotations
@@ -202,11 +203,18 @@ OTHER_HEADER = ["vibration", "gut", "from landmark, mm", "holds %", "percent of 
 def main() -> None:
     """Run all recordings on all cores and record one table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--seeds", type=int, nargs="+", default=list(HELD_OUT_SEEDS))
-    parser.add_argument("--duration", type=float, default=333.0)
+    parser.add_argument("--rendered", action="store_true", help="see benchmarks/rendered_lesions.py")
+    parser.add_argument("--seeds", type=int, nargs="+")
+    parser.add_argument("--duration", type=float)
     parser.add_argument("--scenes", nargs="+", default=["gaussian:1", "peristalsis:3", "collision:5"])
     parser.add_argument("--name", default="lesions")
     arguments = parser.parse_args()
+    if arguments.rendered:
+        from rendered_lesions import main_rendered  # loads torch
+
+        main_rendered(arguments)
+        return
+    arguments.seeds, arguments.duration = arguments.seeds or list(HELD_OUT_SEEDS), arguments.duration or 333.0
     scenes = [(scene.split(":")[0], int(scene.split(":")[1])) for scene in arguments.scenes]
     jobs = [(kind, organ, level, driving, seed, arguments.duration) for kind, level in scenes
             for organ in ("small-bowel", "colon") for driving in ("natural", "operated") for seed in arguments.seeds]

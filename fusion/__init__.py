@@ -4,7 +4,9 @@
     refined = fusion.refine(recording, motions)
 """
 
-from fusion.compare import Comparison, compare, compare_paths, format_table
+from fusion.compare import Comparison, compare
+from fusion.compare_files import compare_paths, write_comparison
+from fusion.compare_text import format_table
 from fusion.config import RefineConfig, config_from_dict, load_config
 from fusion.lesions import Lesion, LesionTable, Sighting, locate, read_lesions, read_sightings, write_lesions
 from fusion.refine import refine
@@ -16,6 +18,6 @@ from fusion.summary import summarize
 __all__ = [
     "Comparison", "ImuConclusion", "Lesion", "LesionTable", "Provenance", "RefineConfig", "Refinement", "Run",
     "ScaleConclusion", "Sighting", "compare", "compare_paths", "config_from_dict", "format_table", "load_config",
-    "locate", "read_lesions", "read_refinement", "read_run", "read_sightings", "refine", "summarize", "write_lesions",
-    "write_run",
+    "locate", "read_lesions", "read_refinement", "read_run", "read_sightings", "refine", "summarize",
+    "write_comparison", "write_lesions", "write_run",
 ]

@@ -1,5 +1,5 @@
 """The command line: `capsule-vio demo | doctor | simulate | convert | inspect | train | evaluate | predict | refine |
-compare | locate | report`.
+compare | locate | report | view`.
 
 Exit codes: 0 done; 2 wrong usage; 3 the input cannot be used; 4 no estimator produced a trajectory;
 1 a bug (traceback). Heavy libraries load only in the command that needs them.
@@ -14,9 +14,8 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any
 
-from tqdm import tqdm
-
 from fusion.cli_parser import build_parser
+from fusion.cli_progress import Progress
 from vio.errors import UsageError, VioError
 
 
@@ -26,44 +25,21 @@ def main(argv: Sequence[str] | None = None) -> int:
     commands: dict[str, Callable[[argparse.Namespace], int]] = {
         "demo": _demo, "doctor": _doctor, "simulate": _simulate, "convert": _convert, "inspect": _inspect,
         "train": _train, "evaluate": _evaluate, "predict": _predict, "refine": _refine, "compare": _compare,
-        "locate": _locate, "report": _report,
+        "locate": _locate, "report": _report, "view": _view,
     }
     try:
         return commands[arguments.command](arguments)
     except VioError as error:
-        print(f"capsule-vio {arguments.command}: {error}", file=sys.stderr)
+        print(f"capsule-vio {arguments.command}: {_one_line(error)}", file=sys.stderr)
         return error.exit_code
     except KeyboardInterrupt:
         print("interrupted; nothing half-written was kept", file=sys.stderr)
         return 130
 
 
-class _Progress:
-    """Stages on stderr: a line that rewrites itself on a terminal, plain lines otherwise."""
-
-    def __init__(self) -> None:
-        self.bar = tqdm(bar_format="{desc} {elapsed}", leave=False, disable=not sys.stderr.isatty())
-
-    def __enter__(self) -> _Progress:
-        return self
-
-    def __exit__(self, *error: object) -> None:
-        self.bar.close()
-
-    def __call__(self, stage: str) -> None:
-        """Announce a stage."""
-        text = f"… {stage.replace('_', ' ')}"
-        if self.bar.disable:
-            print(text, file=sys.stderr, flush=True)
-        else:
-            self.bar.set_description_str(text)
-
-    def count(self, done: int, total: int) -> None:
-        """Announce how much of a known total is done, in steps of a tenth where lines are plain."""
-        if not self.bar.disable:
-            self.bar.set_description_str(f"… {done} of {total}")
-        elif done * 10 // total != (done - 1) * 10 // total:
-            self(f"{done} of {total}")
+def _one_line(error: VioError) -> str:
+    """The message on one line, without what a terminal would take for a command (file names can hold anything)."""
+    return "".join(c if c.isprintable() or c == "\u00a0" else " " for c in str(error))
 
 
 def _print_json(value: Any) -> None:
@@ -71,10 +47,10 @@ def _print_json(value: Any) -> None:
 
 
 def _demo(arguments: argparse.Namespace) -> int:
-    from fusion.compare import format_table
+    from fusion.compare_text import format_table
     from fusion.demo import run_demo
 
-    with _Progress() as progress:
+    with Progress() as progress:
         demo = run_demo(arguments.out, arguments.seed, progress)
     if arguments.json:
         _print_json(demo.comparison.to_dict())
@@ -109,7 +85,7 @@ def _simulate(arguments: argparse.Namespace) -> int:
     if arguments.no_images:
         write_asl(recording, arguments.out)
     else:
-        with _Progress() as progress:
+        with Progress() as progress:
             write_rendered(simulation, arguments.out, products=arguments.products, progress=progress.count)
     if arguments.motions is not None:
         truth, T_body_camera = recording.truth_at_frames(), recording.calibration.T_body_camera
@@ -125,7 +101,7 @@ def _simulate_dataset(arguments: argparse.Namespace) -> int:
     if arguments.no_images or arguments.motions is not None or arguments.products:
         raise UsageError("--dataset writes images; it goes without --no-images, --motions and --products")
     sequences = plan(arguments.dataset, arguments.seed, arguments.duration, arguments.camera, arguments.size)
-    with _Progress() as progress:
+    with Progress() as progress:
         manifest = write_dataset(sequences, arguments.out, arguments.workers, progress.count)
     print(f"{manifest}: {len(sequences)} sequences")
     return 0
@@ -149,7 +125,7 @@ def _convert(arguments: argparse.Namespace) -> int:
         recording = open_recording(arguments.source, arguments.format, declared)
         write_kalibr(recording.calibration, arguments.out)
     else:
-        with _Progress() as progress:
+        with Progress() as progress:
             recording = convert_to_asl(arguments.source, arguments.out, arguments.format, declared, progress.count)
     found = describe(recording)
     if arguments.json:
@@ -164,7 +140,12 @@ def _inspect(arguments: argparse.Namespace) -> int:
     from vio.formats import open_recording
     from vio.inspection import format_inspection, inspect_recording
 
-    inspection = inspect_recording(open_recording(arguments.recording))
+    recording = open_recording(arguments.recording)
+    inspection = inspect_recording(recording, pixels=arguments.html is not None)
+    if arguments.html is not None:
+        from fusion.report.inspection_page import write_inspection
+
+        write_inspection(replace(recording, name=arguments.html.stem), inspection, arguments.html)
     if arguments.json:
         _print_json(inspection.to_dict())
     else:
@@ -182,7 +163,7 @@ def _train(arguments: argparse.Namespace) -> int:
 
     recordings, others = ([open_recording(path) for path in paths]
                           for paths in (arguments.recordings, arguments.calibrate))
-    with _Progress() as progress:
+    with Progress() as progress:
         trained = run_training(recordings, others, vars(arguments), progress.count)
     print(trained)
     return 0
@@ -213,7 +194,7 @@ def _predict(arguments: argparse.Namespace) -> int:
     else:
         import learned
 
-        with _Progress() as progress:
+        with Progress() as progress:
             motions = learned.predict(recording, arguments.weights, rotation=arguments.rotation,
                                       depth_dir=arguments.depth, progress=progress.count,
                                       unfinished=arguments.out.with_name(f"{arguments.out.name}.unfinished"))
@@ -245,9 +226,10 @@ def _refine(arguments: argparse.Namespace) -> int:
 
         motions = learned.predict(recording, arguments.weights)
     inputs = {name: path for name, path in inputs.items() if path.is_file()}
-    with _Progress() as progress:
+    with Progress() as progress:
         refined = refine(recording, motions, config, progress)
-    command = ["refine", arguments.recording.name, "--out", arguments.out.name]
+    # What people call their files may be a patient's name: a run is named after the folder it is written to.
+    refined, command = replace(refined, name=arguments.out.resolve().name), ["refine", "REC", "--out", "RUN"]
     summary = write_run(refined, arguments.out, Provenance(command, config, inputs), motions)
     if arguments.json:
         _print_json(summary)
@@ -258,7 +240,7 @@ def _refine(arguments: argparse.Namespace) -> int:
 
 
 def _sentences(summary: dict[str, Any]) -> str:
-    from fusion.compare import verdict
+    from fusion.compare_text import verdict
 
     scale, fallback = summary["scale"], summary["fallback_reason"]
     lines = [
@@ -273,9 +255,12 @@ def _sentences(summary: dict[str, Any]) -> str:
 
 
 def _compare(arguments: argparse.Namespace) -> int:
-    from fusion.compare import compare_paths, format_table
+    from fusion.compare_files import compare_paths, write_comparison
+    from fusion.compare_text import format_table
 
     comparison = compare_paths(arguments.runs, arguments.truth)
+    if arguments.out is not None:
+        write_comparison(comparison, arguments.out)
     if arguments.json:
         _print_json(comparison.to_dict())
     else:
@@ -308,10 +293,28 @@ def _report(arguments: argparse.Namespace) -> int:
     from fusion.report import write_report
     from fusion.run_folder import read_run
     from fusion.run_states import read_refinement
+    from vio.formats import open_recording
 
+    recording = None if arguments.recording is None else open_recording(arguments.recording)
     refinement, summary = read_refinement(arguments.run), read_run(arguments.run).summary
-    write_report(refinement, summary, arguments.run / "report.html", lesions=read_lesions(arguments.run))
+    write_report(refinement, summary, arguments.run / "report.html", lesions=read_lesions(arguments.run),
+                 recording=recording)
     print(arguments.run / "report.html")
+    return 0
+
+
+def _view(arguments: argparse.Namespace) -> int:
+    from fusion.lesions import read_lesions
+    from fusion.run_states import read_refinement
+    from fusion.view import write_rerun
+    from vio.depth_folder import read_depth_folder
+    from vio.formats import open_recording
+
+    recording = None if arguments.recording is None else open_recording(arguments.recording)
+    depth = None if arguments.depth is None else read_depth_folder(arguments.depth, recording)
+    write_rerun(read_refinement(arguments.run), arguments.out, recording=recording, depth=depth,
+                lesions=read_lesions(arguments.run))
+    print(f"{arguments.out}: open it with `rerun {arguments.out.name}`")
     return 0
 
 

@@ -28,7 +28,7 @@ def build_parser() -> argparse.ArgumentParser:
     parser.add_argument("--version", action="version", version=f"%(prog)s {_version()}")
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
     for add in (_demo, _doctor, _simulate, _convert, _inspect, _train, _evaluate, _predict, _refine, _compare, _locate,
-                _report):
+                _report, _view):
         add(commands)
     return parser
 
@@ -108,8 +108,11 @@ def _convert(commands: Commands) -> None:
 
 
 def _inspect(commands: Commands) -> None:
-    parser = _command(commands, "inspect", "say what a recording holds and whether it can be used", "inspect REC")
+    parser = _command(commands, "inspect", "say what a recording holds and whether it can be used",
+                      "inspect REC --html inspection.html")
     parser.add_argument("recording", type=Path, metavar="REC")
+    parser.add_argument("--html", type=Path, metavar="FILE", help="also look at the images, whether camera and gyro "
+                        "agree, and write a page with pictures of rates, holes, gravity and vibration")
     _json(parser)
 
 
@@ -175,6 +178,8 @@ def _compare(commands: Commands) -> None:
                       "compare RUN other.tum --truth truth.tum")
     parser.add_argument("runs", type=Path, nargs="+", metavar="RUN", help="run folder or TUM file")
     parser.add_argument("--truth", type=Path, metavar="traj.tum", help="default: the truth a run folder holds")
+    parser.add_argument("--out", type=Path, metavar="DIR",
+                        help="also write comparison.json, table.txt, and the compared frames as TUM files for evo")
     _json(parser)
 
 
@@ -198,5 +203,16 @@ def _locate(commands: Commands) -> None:
 
 def _report(commands: Commands) -> None:
     parser = _command(commands, "report", "write a run's report.html again, with the lesions that locate placed",
-                      "report RUN")
+                      "report RUN --recording REC")
     parser.add_argument("run", type=Path, metavar="RUN", help="run folder that refine wrote")
+    parser.add_argument("--recording", type=Path, metavar="REC",
+                        help="the recording that was refined: pictures of the lesions")
+
+
+def _view(commands: Commands) -> None:
+    parser = _command(commands, "view", "write a run for the rerun viewer: poses, frames, depth and lesions over time",
+                      "view RUN --recording REC --out run.rrd")
+    parser.add_argument("run", type=Path, metavar="RUN", help="run folder that refine wrote")
+    parser.add_argument("--recording", type=Path, metavar="REC", help="the recording that was refined: its frames")
+    parser.add_argument("--depth", type=Path, metavar="DIR", help="depth maps that predict --depth wrote")
+    parser.add_argument("--out", type=Path, required=True, metavar="FILE.rrd")

@@ -1,52 +1,75 @@
-"""Runs and trajectories side by side: the same frames, the same alignment, and a plain verdict."""
+"""Runs and trajectories side by side: the same frames, the same alignment, and how sure the difference is."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from pathlib import Path
+from collections.abc import Sequence
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-from fusion.run_folder import Run, read_run
-from vio.alignment import MODES, associate
-from vio.errors import TrajectoryError
-from vio.formats.tum import read_tum
+from fusion.compare_text import best_of, over_recordings, verdict
+from fusion.paired import PairedDifference, RatioOverRecordings, paired_difference, ratio_over_recordings
+from vio.alignment import MODES, Mode, align, associate
+from vio.errors import DegenerateAlignmentError, TrajectoryError
 from vio.metrics import accuracy_table
 from vio.trajectory import Trajectory
 
-TITLES = {"none": "none", "origin": "origin", "yaw4": "yaw4", "se3": "SE3", "sim3": "Sim3"}
-VERDICT_ALIGNMENT = "se3"
-TIE = 1e-3
-"""Errors that differ by less than this share are equal: a run that fell back to its motions neither wins nor loses."""
-MOTIONS_ONLY, REFINED = ": motions only", ": refined"
+Array = NDArray[np.float64]
+
+VERDICT_ALIGNMENT: Mode = "se3"
+
+
+@dataclass(frozen=True)
+class Difference:
+    """Two estimates of one recording against each other."""
+
+    first: str
+    second: str
+    under: dict[str, PairedDifference]
+    """By alignment; those that a track does not determine are absent."""
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain values."""
+        return {"first": self.first, "second": self.second,
+                "under": {mode: difference.to_dict() for mode, difference in self.under.items()}}
 
 
 @dataclass(frozen=True)
 class Comparison:
-    """Accuracy of several estimates on the frames they all share."""
+    """Accuracy of several estimates of one recording on the frames they all share; or of several recordings."""
 
     frames: int
-    """How many frames all estimates and the truth share."""
+    """How many frames all estimates and the truth share, added over the recordings."""
     truth_frames: int
     rows: dict[str, dict[str, Any]]
     """Per estimate the `accuracy` block of `summary.json`."""
     verdicts: tuple[str, ...]
-    """One sentence per run that holds both a learned-only and a refined trajectory."""
+    """One sentence per pair, then who is best of all, then what holds over several recordings."""
+    differences: tuple[Difference, ...] = ()
+    """One per pair, and the best estimate against the next best where there are more than two."""
+    over: RatioOverRecordings | None = None
+    """Refined against motions alone over several recordings."""
+    matched: dict[str, tuple[Trajectory, Trajectory]] = field(default_factory=dict, repr=False)
+    """Per estimate its poses and those of truth at the shared frames, not aligned."""
 
     def to_dict(self) -> dict[str, Any]:
         """Plain values for `--json`."""
         return {"frames": self.frames, "truth_frames": self.truth_frames, "accuracy": self.rows,
-                "verdicts": list(self.verdicts)}
+                "verdicts": list(self.verdicts), "differences": [d.to_dict() for d in self.differences],
+                "over_recordings": None if self.over is None else self.over.to_dict()}
 
 
-def compare(estimates: dict[str, Trajectory], truth: Trajectory, pairs: list[tuple[str, str]]) -> Comparison:
-    """Compare estimates with truth on the frames that all of them share.
+def compare(estimates: dict[str, Trajectory], truth: Trajectory, pairs: list[tuple[str, str]],
+            seed: int = 0) -> Comparison:
+    """Compare estimates of one recording with truth on the frames that all of them share.
 
     Args:
         estimates: trajectories by name.
         truth: the reference.
         pairs: (motions-only, refined) names to pass a verdict on.
+        seed: of the bootstrap.
 
     Raises:
         TrajectoryError: no frame is shared by all.
@@ -57,90 +80,68 @@ def compare(estimates: dict[str, Trajectory], truth: Trajectory, pairs: list[tup
     if not matched or len(shared) == 0:
         raise TrajectoryError("compare: no frame is shared by all trajectories and the truth; check their clocks")
     reference = truth.select(np.isin(truth.t_s, shared))
-    rows = {}
-    for name, estimate in matched.items():
-        rows[name] = accuracy_table(estimate.select(np.isin(estimate.t_s, shared)), reference)
-    verdicts = tuple(verdict(rows[only], rows[refined], only, refined) for only, refined in pairs)
-    return Comparison(len(shared), len(truth), rows, verdicts)
+    judged = {name: estimate.select(np.isin(estimate.t_s, shared)) for name, estimate in matched.items()}
+    rows = {name: accuracy_table(estimate, reference) for name, estimate in judged.items()}
+    errors = {name: _errors(estimate, reference) for name, estimate in judged.items()}
+    differences = [_difference(errors, *pair, seed) for pair in pairs]
+    sentences = [verdict(rows[d.first], rows[d.second], d.first, d.second, d.under.get(VERDICT_ALIGNMENT))
+                 for d in differences]
+    if (leaders := _leaders(rows, pairs)) is not None:
+        best, following = leaders
+        differences.append(_difference(errors, following, best, seed))
+        sentences.append(best_of(len(rows), best, following, rows, differences[-1].under[VERDICT_ALIGNMENT]))
+    return Comparison(len(shared), len(truth), rows, tuple(sentences), tuple(differences), None,
+                      {name: (estimate, reference) for name, estimate in judged.items()})
 
 
-def verdict(only: dict[str, Any], refined: dict[str, Any], only_name: str = "motions only",
-            refined_name: str = "refined") -> str:
-    """One sentence: which of the two is more accurate, and by how much, under the same SE3 alignment."""
-    a, b = only[VERDICT_ALIGNMENT], refined[VERDICT_ALIGNMENT]
-    if "unavailable" in a or "unavailable" in b:
-        return f"{refined_name} against {only_name}: no verdict, {a.get('unavailable') or b.get('unavailable')}"
-    left, right = b["ate_rmse_m"], a["ate_rmse_m"]
-    numbers = f"ATE {1e3 * left:.2f} mm against {1e3 * right:.2f} mm, SE3-aligned"
-    if abs(left - right) <= TIE * max(left, right):
-        return f"{refined_name} ties with {only_name}: {numbers}"
-    if left < right:
-        return f"{refined_name} beats {only_name}: {numbers} ({left / right:.2f} of the error is left)"
-    return f"{refined_name} LOSES to {only_name}: {numbers} ({left / max(right, 1e-300):.2f} times the error)"
+def join(parts: Sequence[Comparison], pairs: Sequence[list[tuple[str, str]]], seed: int = 0) -> Comparison:
+    """Several recordings in one table, with what their pairs say together.
 
-
-def compare_paths(paths: list[Path], truth_path: Path | None) -> Comparison:
-    """Compare run folders and TUM files.
-
-    A run folder stands for two rows, its motions alone and its refined trajectory.
-
-    Raises:
-        TrajectoryError: no truth was given and no run folder holds one.
-        FormatError: a file is not what it should be.
+    Args:
+        parts: one comparison per recording; no name is in two of them.
+        pairs: the (motions-only, refined) names of each.
+        seed: of the bootstrap.
     """
-    estimates: dict[str, Trajectory] = {}
-    pairs: list[tuple[str, str]] = []
-    truth = None if truth_path is None else read_tum(truth_path)
-    for path in paths:
-        if not path.is_dir():
-            estimates[_free_name(path.stem, estimates)] = read_tum(path)
+    rows = {name: row for part in parts for name, row in part.rows.items()}
+    ratios = [[_log_ratio(rows[only], rows[refined]) for only, refined in some] for some in pairs]
+    known = [finite for some in ratios if (finite := [value for value in some if np.isfinite(value)])]
+    over = ratio_over_recordings(known, seed) if len(known) >= 2 else None
+    sentences = [sentence for part in parts for sentence in part.verdicts]
+    if over is not None:
+        sentences.append(over_recordings(over))
+    return Comparison(sum(part.frames for part in parts), sum(part.truth_frames for part in parts), rows,
+                      tuple(sentences), tuple(d for part in parts for d in part.differences), over,
+                      {name: pair for part in parts for name, pair in part.matched.items()})
+
+
+def _errors(estimate: Trajectory, reference: Trajectory) -> dict[str, Array]:
+    """(N,) distances from truth under every alignment that is determined."""
+    errors: dict[str, Array] = {}
+    for mode in MODES:
+        try:
+            aligned = align(estimate, reference, mode).apply(estimate)
+        except DegenerateAlignmentError:
             continue
-        run = read_run(path)
-        truth = _truth_of(path) if truth is None else truth
-        names = _run_names(run, estimates)
-        estimates |= dict(zip(names, (run.motions_only, run.refined), strict=True))
-        pairs.append(names)
-    if truth is None:
-        raise TrajectoryError("compare: no truth; give --truth traj.tum (runs of recordings with truth bring it)")
-    return compare(estimates, truth, pairs)
+        errors[mode] = np.linalg.norm(aligned.positions_m - reference.positions_m, axis=1)
+    return errors
 
 
-def _truth_of(folder: Path) -> Trajectory | None:
-    path = folder / "truth.tum"
-    return read_tum(path) if path.is_file() else None
+def _difference(errors: dict[str, dict[str, Array]], first: str, second: str, seed: int) -> Difference:
+    under: dict[str, PairedDifference] = {
+        mode: paired_difference(errors[first][mode], errors[second][mode], seed)
+        for mode in MODES if mode in errors[first] and mode in errors[second]}
+    return Difference(first, second, under)
 
 
-def _run_names(run: Run, taken: dict[str, Trajectory]) -> tuple[str, str]:
-    base = _free_name(run.name, {name.removesuffix(REFINED): t for name, t in taken.items()})
-    return base + MOTIONS_ONLY, base + REFINED
+def _leaders(rows: dict[str, dict[str, Any]], pairs: list[tuple[str, str]]) -> tuple[str, str] | None:
+    """The best and the next best estimate, where the verdicts on pairs do not say so already."""
+    ates = sorted((row[VERDICT_ALIGNMENT]["ate_rmse_m"], k, name) for k, (name, row) in enumerate(rows.items())
+                  if "unavailable" not in row[VERDICT_ALIGNMENT])
+    if len(ates) < 2 or (len(rows) == 2 and pairs):
+        return None
+    return ates[0][2], ates[1][2]
 
 
-def _free_name(name: str, taken: dict[str, Trajectory]) -> str:
-    candidate, n = name, 2
-    while candidate in taken:
-        candidate, n = f"{name} ({n})", n + 1
-    return candidate
-
-
-def format_table(comparison: Comparison) -> str:
-    """The comparison as a table for a terminal: ATE in mm per alignment, rotation in degrees, scale error."""
-    header = ["", *(f"ATE {TITLES[m]}" for m in MODES), "rotation SE3", "scale error"]
-    body = [[name, *(_ate_text(row[m]) for m in MODES), _rotation_text(row["se3"]), _scale_text(row["scale_error"])]
-            for name, row in comparison.rows.items()]
-    widths = [max(len(line[k]) for line in [header, *body]) for k in range(len(header))]
-    lines = ["  ".join(cell.ljust(w) if k == 0 else cell.rjust(w) for k, (cell, w) in
-                       enumerate(zip(line, widths, strict=True))).rstrip() for line in [header, *body]]
-    matched = f"{comparison.frames} of {comparison.truth_frames} frames matched; ATE is the rmse of position"
-    return "\n".join([*lines, matched, *comparison.verdicts])
-
-
-def _ate_text(cell: dict[str, Any]) -> str:
-    return "unavailable" if "unavailable" in cell else f"{1e3 * cell['ate_rmse_m']:.2f} mm"
-
-
-def _rotation_text(cell: dict[str, Any]) -> str:
-    return "unavailable" if "unavailable" in cell else f"{np.rad2deg(cell['rotation_rmse_rad']):.2f} deg"
-
-
-def _scale_text(value: Any) -> str:
-    return "unavailable" if isinstance(value, dict) else f"{100 * value:+.1f} %"
+def _log_ratio(only: dict[str, Any], refined: dict[str, Any]) -> float:
+    a, b = (row[VERDICT_ALIGNMENT].get("ate_rmse_m", np.nan) for row in (only, refined))
+    return float(np.log(b / a)) if a > 0 and b > 0 else float("nan")

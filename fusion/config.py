@@ -95,7 +95,8 @@ def load_config(path: str | Path) -> RefineConfig:
     except UnicodeDecodeError as error:
         raise ConfigError(f"{path.name}: cannot be read ({error})") from None
     except yaml.YAMLError as error:
-        raise ConfigError(f"{path.name}: not valid YAML ({str(error).splitlines()[0]})") from None
+        reason = str(error).splitlines()[0]
+        raise ConfigError(f"{path.name}: not valid YAML ({reason}); write `key: value` lines") from None
     if values is None:
         values = {}
     if not isinstance(values, dict):

@@ -6,7 +6,8 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from fusion.compare import Comparison, compare_paths
+from fusion.compare import Comparison
+from fusion.compare_files import compare_paths
 from fusion.config import RefineConfig
 from fusion.refine import refine
 from fusion.run_folder import Provenance, write_run

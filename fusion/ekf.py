@@ -178,7 +178,8 @@ def ekf_estimate(problem: Problem, R_world_body_first: Array, initial: InitialCo
     motion_of = problem.motions.surest_neighbours(len(problem))
     updates = int((motion_of >= 0).sum())
     if updates == 0:
-        raise EstimationError("ekf: no motion joins two neighbouring frames, and the filter uses no others")
+        raise EstimationError("ekf: no motion joins two neighbouring frames, and the filter uses no others; "
+                              "give such motions or use the graph")
     ekf = _CapsuleEkf(problem, R_world_body_first, initial)
     m = len(problem)
     T, cov, v = np.tile(np.eye(4), (m, 1, 1)), np.zeros((m, 6, 6)), np.zeros((m, 3))

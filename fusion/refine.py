@@ -20,6 +20,7 @@ from fusion.stages import Stages
 from vio import se3
 from vio.errors import EstimationError
 from vio.imu import preintegrate_rotation
+from vio.inertial_levels import inertial_levels
 from vio.motions import RelativeMotions, chain_motions
 from vio.recording import Recording
 from vio.trajectory import Trajectory
@@ -109,6 +110,7 @@ def _conclude(recording: Recording, motions: RelativeMotions, problem: Problem, 
         timing_s=dict(stages.seconds), peak_rss_bytes=_peak_rss_bytes(), joint=estimate.joint,
         view=View(problem.first_frame, problem.motions.T_body_camera, recording.calibration.camera,
                   motions.scale_log_mean),
+        inertial=inertial_levels(recording.imu, recording.imu_t_s),
     )
 
 

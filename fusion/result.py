@@ -10,12 +10,17 @@ from numpy.typing import NDArray
 
 from fusion.joint import JointSamples
 from vio.camera import Camera
+from vio.errors import RecordingError
 from vio.imu import Gap
+from vio.inertial_levels import InertialLevels
+from vio.recording import Recording
 from vio.trajectory import Trajectory
 
 Array = NDArray[np.float64]
 Estimator = Literal["graph", "ekf", "motions"]
 ScalePolicy = Literal["free", "prior", "fixed"]
+
+SAME_FRAME_S = 1e-3
 
 
 @dataclass(frozen=True)
@@ -96,3 +101,18 @@ class Refinement:
     """How the errors of all poses hang together; None where that could not be sampled."""
     view: View | None = None
     """How the frames looked at the world; None when unknown."""
+    inertial: InertialLevels | None = None
+    """What the IMU felt along time; None when unknown."""
+
+
+def check_same_recording(refinement: Refinement, recording: Recording) -> None:
+    """Make sure that a recording is the one that was refined, by the times of its frames.
+
+    Raises:
+        RecordingError: its frames are not those of the trajectory.
+    """
+    t, first = refinement.trajectory.t_s, 0 if refinement.view is None else refinement.view.first_frame
+    frames = recording.frame_t_s[first:first + len(t)]
+    if len(frames) != len(t) or np.abs(frames - t).max() > SAME_FRAME_S:
+        raise RecordingError(f"recording {recording.name} does not have the frames of the trajectory of "
+                             f"{refinement.name}; give the recording that was refined")

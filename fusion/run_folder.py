@@ -14,7 +14,7 @@ import numpy as np
 
 from fusion.config import RefineConfig
 from fusion.result import Refinement
-from fusion.run_states import joint_arrays, view_arrays
+from fusion.run_states import inertial_arrays, joint_arrays, view_arrays
 from fusion.summary import summarize
 from vio.atomic import atomic_folder
 from vio.errors import FormatError
@@ -34,7 +34,7 @@ class Provenance:
     """The command line, without folders: only the names of files."""
     config: RefineConfig
     inputs: dict[str, Path]
-    """Input files by role; only their names and SHA-256 are recorded."""
+    """Input files by role; only that and their SHA-256 are recorded: a file name may be a patient's."""
     seed: int | None = None
 
 
@@ -91,7 +91,7 @@ def read_run(folder: str | Path) -> Run:
     except OSError:
         raise FormatError(f"{folder.name}: no summary.json; give a folder written by `capsule-vio refine`") from None
     except ValueError as error:
-        raise FormatError(f"{folder.name}/summary.json: not valid JSON ({error})") from None
+        raise FormatError(f"{folder.name}/summary.json: not valid JSON ({error}); write the run again") from None
     if not isinstance(summary, dict) or summary.get("schema") != 1:
         raise FormatError(f"{folder.name}/summary.json: not a summary of schema 1; write the run again")
     refined, motions_only = read_tum(folder / "trajectory.tum"), read_tum(folder / "motions_only.tum")
@@ -103,6 +103,7 @@ def _write_states(r: Refinement, path: Path) -> None:
         path, t=r.trajectory.t_s, T_world_body=r.trajectory.T_world_body, cov=np.asarray(r.trajectory.cov),
         velocity=r.velocity_m_s, gyro_bias=r.gyro_bias_rad_s, accel_bias=r.accel_bias_m_s2, log_scale=r.log_scale,
         log_scale_sd=r.log_scale_sd, rejected=r.rejected, **joint_arrays(r.joint), **view_arrays(r.view),
+        **inertial_arrays(r.inertial),
     )
 
 
@@ -118,7 +119,8 @@ def _manifest(provenance: Provenance) -> dict[str, Any]:
         "config": provenance.config.to_dict(),
         "seed": provenance.seed,
         "libraries": {name: _version(name) for name in LIBRARIES} | {"python": platform.python_version()},
-        "inputs": {role: {"name": path.name, "sha256": sha256_of(path)} for role, path in provenance.inputs.items()},
+        "inputs": {role: {"name": f"{role}{path.suffix}", "sha256": sha256_of(path)}
+                   for role, path in provenance.inputs.items()},
     }
 
 

@@ -17,6 +17,7 @@ from vio.camera import Camera
 from vio.errors import FormatError, VioError
 from vio.formats.tum import read_tum
 from vio.imu import Gap
+from vio.inertial_levels import InertialLevels
 from vio.motions import UNREADABLE
 from vio.trajectory import Trajectory
 
@@ -43,6 +44,15 @@ def view_arrays(view: View | None) -> dict[str, Any]:
             "prior_log_scale": np.float64(view.prior_log_scale), "camera": np.array(json.dumps(camera))}
 
 
+def inertial_arrays(levels: InertialLevels | None) -> dict[str, Any]:
+    """What the IMU felt, as keys of `trajectory.npz`; single precision is enough for the eye."""
+    if levels is None:
+        return {}
+    return {"inertial_t": levels.t_s, "inertial_rate": levels.rate_rad_s.astype(np.float32),
+            "inertial_force": levels.force_m_s2.astype(np.float32),
+            "inertial_vibration": levels.vibration_m_s2.astype(np.float32)}
+
+
 def read_refinement(folder: str | Path) -> Refinement:
     """The refinement that a run folder holds. Runs of earlier versions come without joint samples and view.
 
@@ -59,18 +69,18 @@ def read_refinement(folder: str | Path) -> Refinement:
         trajectory = Trajectory(arrays["t"], arrays["T_world_body"], arrays["cov"])
         m = len(trajectory)
         states = {key: _shaped(arrays[key], (m, *shape), key) for key, shape in SHAPES.items()}
-        joint, view = _joint(arrays, m), _view(arrays)
+        joint, view, inertial = _joint(arrays, m), _view(arrays), _inertial(arrays)
     except KeyError as error:
         raise FormatError(f"{name}: missing key {error}; {AGAIN}") from None
     except (VioError, *UNREADABLE) as error:
         reason = (str(error).splitlines() or [type(error).__name__])[0]
         raise FormatError(f"{name}: {reason}; {AGAIN}") from None
-    return _refinement(folder, run.summary, run.motions_only, trajectory, states, arrays, joint, view)
+    return _refinement(folder, run.summary, run.motions_only, trajectory, states, arrays, joint, view, inertial)
 
 
 def _refinement(folder: Path, summary: dict[str, Any], motions_only: Trajectory, trajectory: Trajectory,
                 states: dict[str, Array], arrays: dict[str, Any], joint: JointSamples | None,
-                view: View | None) -> Refinement:
+                view: View | None, inertial: InertialLevels | None) -> Refinement:
     truth = folder / "truth.tum"
     try:
         imu, scale, motions = summary["imu"], summary["scale"], summary["motions"]
@@ -85,6 +95,7 @@ def _refinement(folder: Path, summary: dict[str, Any], motions_only: Trajectory,
             rejected=np.asarray(arrays["rejected"], np.int64), bridged=int(motions.get("bridged", 0)),
             time_offset_s=float(summary["time_offset_s"]), truth=read_tum(truth) if truth.is_file() else None,
             timing_s=dict(summary["timing_s"]), peak_rss_bytes=int(summary["peak_rss_bytes"]), joint=joint, view=view,
+            inertial=inertial,
         )
     except KeyError as error:
         raise FormatError(f"{folder.name}: summary.json or trajectory.npz lacks {error}; {AGAIN}") from None
@@ -121,6 +132,13 @@ def _view(arrays: dict[str, Any]) -> View | None:
     camera = json.loads(str(arrays["camera"]))
     return View(int(arrays["first_frame"]), se3.check_transforms(arrays["T_body_camera"], "T_body_camera"),
                 None if camera is None else Camera(**camera), float(arrays["prior_log_scale"]))
+
+
+def _inertial(arrays: dict[str, Any]) -> InertialLevels | None:
+    if "inertial_t" not in arrays:
+        return None
+    rate, force, vibration = (np.asarray(arrays[f"inertial_{name}"], float) for name in ("rate", "force", "vibration"))
+    return InertialLevels(np.asarray(arrays["inertial_t"], float), rate, force, vibration)
 
 
 def _shaped(values: Any, shape: tuple[int, ...], key: str) -> Array:

@@ -81,7 +81,7 @@ def load_yaml(path: str | Path) -> dict[str, Any]:
     except (yaml.YAMLError, ValueError, RecursionError) as error:
         mark, problem = getattr(error, "problem_mark", None), getattr(error, "problem", None) or "malformed"
         line = f" in line {mark.line + 1}" if mark is not None else ""
-        raise CalibrationError(f"{name}: not valid YAML{line} ({problem})") from None
+        raise CalibrationError(f"{name}: not valid YAML{line} ({problem}); repair it") from None
     if not isinstance(data, dict):
         raise CalibrationError(f"{name}: expected `key: value` lines, found {type(data).__name__}")
     return data

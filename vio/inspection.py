@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 
@@ -11,20 +12,14 @@ from vio.errors import VioError
 from vio.imu import find_gaps
 from vio.imu_checks import ImuReport, check_imu
 from vio.recording import Recording, check_refinable
+from vio.sensor_verdicts import Check, gap_check, sync_check, vibration_checks
+from vio.spectrum import Spectrum, imu_spectrum
+from vio.visual_sync import SyncQuality, sync_quality
 
-Level = Literal["ok", "warning", "error"]
-
+GAP_FACTOR = 8.0
+"""Frame intervals over the median from which one counts as a hole; adaptive capsules vary from 2 to 6 per second."""
 JITTER_LIMIT = 0.2
 """Spread of the frame intervals over their median above which the frame rate counts as irregular."""
-
-
-@dataclass(frozen=True)
-class Check:
-    """One verdict."""
-
-    name: str
-    level: Level
-    text: str
 
 
 @dataclass(frozen=True)
@@ -33,6 +28,10 @@ class Inspection:
 
     facts: dict[str, Any]
     checks: tuple[Check, ...]
+    spectrum: Spectrum | None = None
+    """Of the inertial samples; None where they are too few."""
+    sync: SyncQuality | None = None
+    """Camera against gyro; None where nobody asked or it cannot be compared."""
 
     @property
     def usable(self) -> bool:
@@ -41,14 +40,40 @@ class Inspection:
 
     def to_dict(self) -> dict[str, Any]:
         """Plain values for `--json`."""
-        checks = [{"name": c.name, "level": c.level, "text": c.text} for c in self.checks]
+        checks = [{"name": c.name, "level": c.level, "text": c.text, "remedy": c.remedy} for c in self.checks]
         return {"usable": self.usable, "facts": self.facts, "checks": checks}
 
 
-def inspect_recording(recording: Recording) -> Inspection:
-    """Look at everything but the pixels; never raises for what it finds, it says so."""
+def inspect_recording(recording: Recording, pixels: bool = False) -> Inspection:
+    """Look at a recording; never raises for what it finds, it says so.
+
+    Args:
+        recording: what to look at.
+        pixels: also look at the images of the liveliest stretch, whether camera and gyro agree.
+    """
     checks = [_frames(recording), _images(recording), *_imu(recording), _refinable(recording), _truth(recording)]
-    return Inspection(_facts(recording), tuple(checks))
+    spectrum = None
+    if checks_imu_passed(checks):
+        spectrum = imu_spectrum(recording.imu, recording.imu_t_s, recording.calibration.imu_noise)
+        checks += [gap_check(recording), *vibration_checks(spectrum)]
+    sync = None
+    if pixels and checks_imu_passed(checks):
+        sync, check = _sync(recording)
+        checks.append(check)
+    return Inspection(_facts(recording), tuple(checks), spectrum, sync)
+
+
+def checks_imu_passed(checks: Sequence[Check]) -> bool:
+    """Whether the inertial samples can be believed."""
+    return all(check.level != "error" for check in checks if check.name == "imu")
+
+
+def _sync(recording: Recording) -> tuple[SyncQuality | None, Check]:
+    try:
+        sync = sync_quality(recording)
+    except VioError as error:
+        return None, Check("sync", "warning", str(error))
+    return sync, sync_check(sync, recording.calibration.time_offset_s)
 
 
 def _facts(recording: Recording) -> dict[str, Any]:
@@ -79,6 +104,13 @@ def _frames(recording: Recording) -> Check:
     if len(recording) < 3:
         return Check("frames", "warning", f"{len(recording)} frames; a trajectory needs more")
     dt = np.diff(recording.frame_t_s)
+    longest = int(np.argmax(dt))
+    if dt[longest] > GAP_FACTOR * np.median(dt):
+        holes = int((dt > GAP_FACTOR * np.median(dt)).sum())
+        return Check("frames", "warning", f"{len(recording)} frames over {recording.duration_s:.1f} s, median interval "
+                     f"{1e3 * np.median(dt):.1f} ms, {holes} holes; the longest, {dt[longest]:.1f} s, begins at "
+                     f"{recording.frame_t_s[longest]:.1f} s", "motions across holes are unreliable: refine gates them; "
+                     "cut the recording there if they are long")
     spread = float(np.percentile(dt, 95) - np.percentile(dt, 5)) / float(np.median(dt))
     text = f"{len(recording)} frames over {recording.duration_s:.1f} s, median interval {1e3 * np.median(dt):.1f} ms"
     if spread > JITTER_LIMIT:
@@ -94,8 +126,10 @@ def _images(recording: Recording) -> Check:
     if there == len(recording):
         return Check("images", "ok", f"all {there} image files exist")
     if there == 0:
-        return Check("images", "warning", "no image files: refinement with given motions works, prediction does not")
-    return Check("images", "warning", f"{there} of {len(recording)} image files exist; prediction needs all")
+        return Check("images", "warning", "no image files: refinement with given motions works, prediction does not",
+                     "to predict, put the files that cam0/data.csv lists into cam0/data")
+    return Check("images", "warning", f"{there} of {len(recording)} image files exist; prediction needs all",
+                 "copy the missing ones, or cut cam0/data.csv to frames that exist")
 
 
 def _imu(recording: Recording) -> list[Check]:
@@ -151,9 +185,12 @@ def _depth_text(recording: Recording) -> str:
 
 
 def format_inspection(inspection: Inspection) -> str:
-    """The inspection as lines for a terminal."""
+    """The inspection as lines for a terminal, every verdict with what to do."""
     marks = {"ok": "ok     ", "warning": "WARNING", "error": "ERROR  "}
     width = max(len(check.name) for check in inspection.checks)
-    lines = [f"{marks[c.level]}  {c.name.ljust(width)}  {c.text}" for c in inspection.checks]
+    lines = []
+    for check in inspection.checks:
+        lines.append(f"{marks[check.level]}  {check.name.ljust(width)}  {check.text}")
+        lines += [f"{' ' * (width + 11)}to do: {check.remedy}"] if check.remedy else []
     verdict = "usable" if inspection.usable else "cannot be refined as it is"
     return "\n".join([f"recording {inspection.facts['name']}: {verdict}", *lines])

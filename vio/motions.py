@@ -113,9 +113,11 @@ def load_motions(path: str | Path) -> RelativeMotions:
     except FileNotFoundError:
         raise MotionsError(f"{path.name}: no such file; write it with `capsule-vio predict`") from None
     except OSError as error:
-        raise MotionsError(f"{path.name}: cannot be read ({error.strerror or error})") from None
+        raise MotionsError(f"{path.name}: cannot be read ({error.strerror or error}); give a file that can") from None
     except UNREADABLE as error:
-        raise MotionsError(f"{path.name}: not a readable npz without pickles ({error})") from None
+        reason = (str(error).split(". ")[0] or type(error).__name__)[:120]
+        raise MotionsError(f"{path.name}: not a readable npz without pickles ({reason}); write it with "
+                           "`capsule-vio predict` or `RelativeMotions.save`") from None
     missing = [key for key in REQUIRED_KEYS if key not in arrays]
     if missing:
         raise MotionsError(f"{path.name}: missing key {missing[0]!r}; required are {', '.join(REQUIRED_KEYS)}")

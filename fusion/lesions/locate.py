@@ -14,7 +14,7 @@ from fusion.lesions.measures import Along, Interval
 from fusion.lesions.merging import Place, merge
 from fusion.lesions.sightings import Sighting, read_sightings
 from fusion.lesions.table import Lesion, LesionTable
-from fusion.result import Refinement
+from fusion.result import Refinement, check_same_recording
 from fusion.run_states import read_refinement
 from vio.depth_folder import read_depth_folder
 from vio.errors import LesionError
@@ -22,7 +22,6 @@ from vio.recording import Recording
 
 DEPTH_RELATIVE_SD = 0.10
 """Standard deviation of a depth as a share of it, where nobody says otherwise."""
-SAME_FRAME_S = 1e-3
 FARTHEST_FRAME_S = 0.5
 """A time further than this (and than half the usual frame spacing) from every frame shows nothing."""
 
@@ -54,19 +53,11 @@ def locate(refined: Refinement | str | Path, lesions: str | Path | Sequence[Sigh
     refinement = refined if isinstance(refined, Refinement) else read_refinement(refined)
     sightings = read_sightings(lesions, video) if isinstance(lesions, (str, Path)) else list(lesions)
     if recording is not None:
-        _check_same(refinement, recording)
+        check_same_recording(refinement, recording)
     source = DepthSource(None if depth is None else read_depth_folder(depth, recording), recording, depth_relative_sd)
     fixes = [_place(refinement, sighting, source) for sighting in sightings]
     places = merge(fixes, refinement.trajectory.t_s)
     return _measure(Course(refinement), places, between)
-
-
-def _check_same(refinement: Refinement, recording: Recording) -> None:
-    t, first = refinement.trajectory.t_s, 0 if refinement.view is None else refinement.view.first_frame
-    frames = recording.frame_t_s[first:first + len(t)]
-    if len(frames) != len(t) or np.abs(frames - t).max() > SAME_FRAME_S:
-        raise LesionError(f"locate: recording {recording.name} does not have the frames of the trajectory of "
-                          f"{refinement.name}; give the recording that was refined")
 
 
 def _place(refinement: Refinement, sighting: Sighting, source: DepthSource) -> Fix:

@@ -35,6 +35,10 @@ class TruthErrors:
     """(K,) distance of the refined positions from truth."""
     motions_m: Array
     """(K,) distance of the motions alone."""
+    refined_rad: Array
+    """(K,) angle of the refined rotations from true ones, under the same alignment."""
+    motions_rad: Array
+    """(K,) angle of the motions alone."""
     first_pose_m: Array
     """(K,) the refined error when the FIRST poses agree in position and yaw, which is what the covariance speaks of."""
     within_3_sigma: float | None
@@ -53,6 +57,8 @@ class Scene:
     """(M, 3)"""
     claimed_sd_m: Array | None
     """(M,) claimed standard deviation of position along its worst axis, relative to the first pose."""
+    claimed_cov_m2: Array | None
+    """(M, 3, 3) claimed covariance of position relative to the first pose, in the axes of `refined_m`."""
     errors: TruthErrors | None
     rejected_frames: NDArray[np.int64] | None
     """Frames that rejected motions start from; None when the refinement alone cannot tell."""
@@ -73,7 +79,8 @@ def make_scene(refinement: Refinement, motions: RelativeMotions | None = None) -
         mode, refined, only = _align_both(refined, only, truth)
         errors = _errors(mode, refinement.trajectory, refined, only, truth)
     T_scene_world = refined.T_world_body[0] @ se3.inverse(refinement.trajectory.T_world_body[0])
-    return Scene(refined.t_s, refined.positions_m, only.positions_m, _claimed_sd(refinement.trajectory), errors,
+    return Scene(refined.t_s, refined.positions_m, only.positions_m, _claimed_sd(refinement.trajectory),
+                 _claimed_cov(refinement.trajectory, refined.rotations), errors,
                  _rejected_frames(refinement, motions), T_scene_world)
 
 
@@ -97,8 +104,14 @@ def _errors(mode: Mode, claimed: Trajectory, refined: Trajectory, only: Trajecto
         mode, refined_k.t_s, truth_k.positions_m,
         np.linalg.norm(refined_k.positions_m - truth_k.positions_m, axis=1),
         np.linalg.norm(only_k.positions_m - truth_k.positions_m, axis=1),
+        _angles_rad(refined_k, truth_k), _angles_rad(only_k, truth_k),
         np.linalg.norm(off, axis=1), _within_3_sigma(off, claimed_k),
     )
+
+
+def _angles_rad(estimate: Trajectory, truth: Trajectory) -> Array:
+    relative = np.swapaxes(truth.rotations, 1, 2) @ estimate.rotations
+    return np.asarray(np.linalg.norm(se3.so3_log(relative), axis=1))
 
 
 def _within_3_sigma(off_m: Array, claimed: Trajectory) -> float | None:
@@ -114,6 +127,12 @@ def _claimed_sd(trajectory: Trajectory) -> Array | None:
     if trajectory.cov is None:
         return None
     return np.asarray(np.sqrt(np.maximum(np.linalg.eigvalsh(trajectory.cov[:, 3:, 3:])[:, -1], 0)))
+
+
+def _claimed_cov(trajectory: Trajectory, R_scene_body: Array) -> Array | None:
+    if trajectory.cov is None:
+        return None
+    return np.asarray(R_scene_body @ trajectory.cov[:, 3:, 3:] @ np.swapaxes(R_scene_body, 1, 2))
 
 
 def _rejected_frames(refinement: Refinement, motions: RelativeMotions | None) -> NDArray[np.int64] | None:

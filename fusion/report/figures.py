@@ -18,8 +18,10 @@ from fusion.result import Refinement
 Array = NDArray[np.float64]
 Figure = dict[str, Any]
 
-LIMIT = 5000
+LIMIT = 3000
 """More points than this a screen cannot show."""
+MOST_GAPS = 200
+"""The longest ones are shaded."""
 AXIS_COLOURS = (("x", "--x"), ("y", "--y"), ("z", "--z"))
 
 
@@ -44,8 +46,8 @@ def trajectory_figure(scene: Scene) -> Figure:
         data.append(_line3(truth, scene.errors.t_s, "truth", "--truth", 3, unit, factor))
     data.append(_line3(scene.motions_m, scene.t_s, "motions alone", "--motions", 3, unit, factor))
     data.append(_line3(scene.refined_m, scene.t_s, "refined", "--refined", 5, unit, factor))
-    data.append(points3(scene.refined_m[:1], "start", "circle", "--refined", 6, factor))
-    data.append(points3(scene.refined_m[-1:], "end", "diamond", "--refined", 6, factor))
+    data.append(points3(scene.refined_m[:1], "start", "circle", "--refined", 6, factor) | {"showlegend": False})
+    data.append(points3(scene.refined_m[-1:], "end", "diamond", "--refined", 6, factor) | {"showlegend": False})
     if scene.rejected_frames is not None and len(scene.rejected_frames):
         at = scene.rejected_frames[_every(len(scene.rejected_frames))]
         data.append(points3(scene.refined_m[at], "motion rejected", "square", "--rejected", 3, factor))
@@ -53,8 +55,8 @@ def trajectory_figure(scene: Scene) -> Figure:
                             "zerolinecolor": "--grid", "color": "--muted", "showspikes": False}
             for axis in "xyz"}
     layout = _layout(height=600) | {"scene": {"aspectmode": "data", "uirevision": "keep", "dragmode": "turntable",
-                                              "camera": {"eye": {"x": 1.25, "y": -1.25, "z": 0.85},
-                                                         "center": {"x": 0, "y": 0, "z": -0.22}}, **axes}}
+                                              "camera": {"eye": {"x": 1.3, "y": -1.3, "z": 0.85},
+                                                         "center": {"x": 0, "y": 0, "z": -0.14}}, **axes}}
     layout["margin"] = {"l": 0, "r": 0, "t": 8, "b": 0}
     return {"data": data, "layout": layout}
 
@@ -65,8 +67,15 @@ def error_figure(errors: TruthErrors, rejected_t_s: Array | None, gaps: Sequence
     data = [line(errors.t_s, errors.motions_m * factor, "motions alone", "--motions", 1.6),
             line(errors.t_s, errors.refined_m * factor, "refined", "--refined", 2.2)]
     if rejected_t_s is not None and len(rejected_t_s):
-        data.append(_ticks(rejected_t_s))
+        data.append(rejected_ticks(rejected_t_s))
     return {"data": data, "layout": time_layout(f"error [{unit}]", errors.t_s, gaps, zero=True)}
+
+
+def rotation_figure(errors: TruthErrors, gaps: Sequence[tuple[float, float]]) -> Figure:
+    """Angle from the true attitude along time, both estimates under the same alignment."""
+    data = [line(errors.t_s, np.rad2deg(errors.motions_rad), "motions alone", "--motions", 1.6),
+            line(errors.t_s, np.rad2deg(errors.refined_rad), "refined", "--refined", 2.2)]
+    return {"data": data, "layout": time_layout("rotation error [°]", errors.t_s, gaps, zero=True)}
 
 
 def claim_figure(scene: Scene, gaps: Sequence[tuple[float, float]]) -> Figure | None:
@@ -121,7 +130,7 @@ def time_layout(
     axis = {"gridcolor": "--grid", "zeroline": False, "linecolor": "--grid", "ticks": "outside", "tickcolor": "--grid",
             "automargin": True}
     shapes = [{"type": "rect", "xref": "x", "yref": "paper", "x0": start, "x1": end, "y0": 0, "y1": 1,
-               "fillcolor": "--gap", "line": {"width": 0}, "layer": "below"} for start, end in gaps[:LIMIT]]
+               "fillcolor": "--gap", "line": {"width": 0}, "layer": "below"} for start, end in _longest(gaps)]
     return _layout(height) | {
         "hovermode": "x unified", "shapes": shapes, "showlegend": True,
         "xaxis": axis | {"title": {"text": "time [s]", "standoff": 6}, "showgrid": False,
@@ -131,6 +140,10 @@ def time_layout(
     }
 
 
+def _longest(gaps: Sequence[tuple[float, float]]) -> list[tuple[float, float]]:
+    return sorted(sorted(gaps, key=lambda gap: gap[0] - gap[1])[:MOST_GAPS])
+
+
 def line(t_s: Array, values: Array, name: str, colour: str, width: float) -> Figure:
     """A curve over time, thinned for the eye."""
     keep = thin(values, LIMIT)
@@ -138,7 +151,8 @@ def line(t_s: Array, values: Array, name: str, colour: str, width: float) -> Fig
             "line": {"color": colour, "width": width}}
 
 
-def _ticks(t_s: Array) -> Figure:
+def rejected_ticks(t_s: Array) -> Figure:
+    """Marks on the time axis where motions were rejected."""
     at = t_s[_every(len(t_s))]
     return {"type": "scatter", "mode": "markers", "name": "motion rejected", "x": numbers(at), "y": [0] * len(at),
             "hoverinfo": "skip", "cliponaxis": False,

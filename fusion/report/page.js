@@ -1,5 +1,6 @@
 "use strict";
 (() => {
+  performance.mark("script");
   const figures = JSON.parse(document.getElementById("figures").textContent);
   const config = {
     responsive: true, displaylogo: false, displayModeBar: innerWidth > 760 ? "hover" : false,
@@ -19,11 +20,23 @@
     return value;
   }
 
-  function draw() {
+  const shown = new Set();
+  function draw(key) {
     const style = getComputedStyle(document.documentElement);
-    for (const key of keys) {
-      Plotly.react(key, paint(figures[key].data, style), paint(figures[key].layout, style), config);
+    Plotly.react(key, paint(figures[key].data, style), paint(figures[key].layout, style), config);
+    if (shown.has(key)) return;
+    if (!shown.size) performance.mark("first-figure");
+    shown.add(key);
+    if (timed.includes(key)) document.getElementById(key).on("plotly_relayout", (change) => follow(key, change));
+  }
+
+  // One figure after the other, so that the page answers while it draws; those in space take longest and come last.
+  async function drawAll() {
+    for (const key of [...timed, ...keys.filter((key) => !timed.includes(key))]) {
+      if (!shown.has(key)) draw(key);
+      await new Promise((next) => setTimeout(next));
     }
+    return Math.round(performance.now());
   }
 
   // Zooming into a span of time shows the same span everywhere.
@@ -33,17 +46,70 @@
     const range = change["xaxis.range"] || [change["xaxis.range[0]"], change["xaxis.range[1]"]];
     if (following || (!reset && range[0] === undefined)) return;
     following = true;
-        const others = timed.filter((key) => key !== source);
+    const others = timed.filter((key) => key !== source);
     const same = (key) => ({ "xaxis.range": reset ? figures[key].layout.xaxis.range : range });
     Promise.all(others.map((key) => Plotly.relayout(key, same(key))))
       .finally(() => { following = false; });
   }
 
-  draw();
-  for (const key of timed) {
-    document.getElementById(key).on("plotly_relayout", (change) => follow(key, change));
+  // Keys: arrows move or turn, + and - zoom, Home goes back.
+  const moves = { ArrowLeft: [-1, 0], ArrowRight: [1, 0], ArrowUp: [0, 1], ArrowDown: [0, -1] };
+  const zooms = { "+": 0.8, "=": 0.8, "-": 1.25, "_": 1.25 };
+
+  function alongTime(key, event) {
+    const home = figures[key].layout.xaxis.range;
+    const [low, high] = document.getElementById(key).layout.xaxis.range.map(Number);
+    const step = moves[event.key], factor = zooms[event.key];
+    if (event.key === "Home") return { "xaxis.range": [...home], "yaxis.autorange": true };
+    if (step && step[0]) return { "xaxis.range": [low, high].map((v) => v + 0.1 * step[0] * (high - low)) };
+    if (factor) return { "xaxis.range": [-0.5, 0.5].map((half) => (low + high) / 2 + half * factor * (high - low)) };
+    return null;
   }
-  matchMedia("(prefers-color-scheme: dark)").addEventListener("change", draw);
-  addEventListener("beforeprint", () => { document.documentElement.dataset.print = ""; draw(); });
-  addEventListener("afterprint", () => { delete document.documentElement.dataset.print; draw(); });
+
+  function inSpace(key, event) {
+    const home = figures[key].layout.scene.camera;
+    const { eye, center } = document.getElementById(key).layout.scene.camera || home;
+    const step = moves[event.key], factor = zooms[event.key];
+    if (event.key === "Home") return { "scene.camera": JSON.parse(JSON.stringify(home)) };
+    if (!step && !factor) return null;
+    const [turn, lift] = step || [0, 0];
+    const angle = Math.atan2(eye.y, eye.x) + 0.15 * turn, flat = Math.hypot(eye.x, eye.y);
+    const rise = Math.max(-1.4, Math.min(1.4, Math.atan2(eye.z, flat) + 0.1 * lift));
+    const far = Math.hypot(flat, eye.z) * (factor || 1);
+    const to = { x: far * Math.cos(rise) * Math.cos(angle), y: far * Math.cos(rise) * Math.sin(angle), z: far * Math.sin(rise) };
+    return { "scene.camera": { eye: to, center, up: { x: 0, y: 0, z: 1 } } };
+  }
+
+  for (const key of keys) {
+    document.getElementById(key).addEventListener("keydown", (event) => {
+      if (!shown.has(key) || event.ctrlKey || event.metaKey || event.altKey) return;
+      const change = figures[key].layout.xaxis ? alongTime(key, event) : inSpace(key, event);
+      if (!change) return;
+      event.preventDefault();
+      Plotly.relayout(key, change);
+    });
+  }
+
+  // Paper is narrower than most windows, and always light.
+  const PAPER_PX = 680;
+  function forPaper() {
+    document.documentElement.dataset.print = "";
+    for (const key of keys) {
+      draw(key);
+      if (figures[key].layout.xaxis) Plotly.relayout(key, { width: PAPER_PX, autosize: false });
+    }
+  }
+
+  function forScreen() {
+    delete document.documentElement.dataset.print;
+    for (const key of keys) {
+      draw(key);
+      Plotly.relayout(key, { width: null, autosize: true });
+    }
+  }
+
+  window.reportDrawn = drawAll();
+  matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => [...shown].forEach(draw));
+  addEventListener("beforeprint", forPaper);
+  addEventListener("afterprint", forScreen);
 })();

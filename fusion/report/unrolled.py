@@ -6,6 +6,7 @@ Labels come from people's files: they are escaped in the table and never enter a
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from html import escape
 from typing import Any
 
@@ -16,13 +17,14 @@ from fusion.lesions.course import Course
 from fusion.lesions.measures import arc_interval, capsule_along
 from fusion.report import figures
 from fusion.report.figures import Figure
+from fusion.report.sections import table
 from fusion.report.words import NBSP
 from fusion.result import Refinement
 
 Array = NDArray[np.float64]
 Row = Mapping[str, Any]
 
-BAND_FRAMES = 400
+BAND_FRAMES, THIN_FRAMES = 400, 12_000
 KINDS = (("finding", "lesions", "circle", "--lesion"), ("landmark", "landmarks", "diamond", "--landmark"))
 
 
@@ -50,16 +52,33 @@ def unrolled_figure(refinement: Refinement, rows: Sequence[Row]) -> Figure:
 
 
 def _band(course: Course, factor: float) -> list[Figure]:
-    """The capsule's 95 % band, drawn at some of the frames; empty where it is unknown."""
+    """The capsule's 95 % band, drawn at some of the frames; empty where it is unknown.
+
+    Long recordings are thinned for it: how the sampled trajectories wind takes most of the time, and the eye sees no
+    difference. The curve and the lesions are not thinned.
+    """
     if course.joint is None:
         return []
-    frames = np.unique(np.linspace(0, len(course.t_s) - 1, BAND_FRAMES).round().astype(np.int64))
-    spread = [arc_interval(capsule_along(course, int(frame))) for frame in frames]
-    _, low, high = (factor * np.array(part, float) for part in zip(*spread, strict=True))
-    t = course.t_s[frames]
+    kept, thin = _thinned(course.refinement)
+    places = np.unique(np.linspace(0, len(kept) - 1, BAND_FRAMES).round().astype(np.int64))
+    spread = [arc_interval(capsule_along(thin, int(place))) for place in places]
+    value, low, high = (np.array(part, float) for part in zip(*spread, strict=True))
+    frames = kept[places]
+    arc = course.centreline.frame_arc_m[frames]
+    t, low, high = course.t_s[frames], factor * (arc + low - value), factor * (arc + high - value)
     return [{"x": figures.numbers(np.concatenate([t, t[::-1]])), "type": "scatter", "mode": "lines",
              "y": figures.numbers(np.concatenate([high, low[::-1]])), "fill": "toself",
              "fillcolor": "--refined-band", "name": "95 % of the capsule", "line": {"width": 0}, "hoverinfo": "skip"}]
+
+
+def _thinned(refinement: Refinement) -> tuple[NDArray[np.int64], Course]:
+    """Which of M frames are kept for the band, at most some `THIN_FRAMES`, and the course through them."""
+    joint, m = refinement.joint, len(refinement.trajectory)
+    every = np.arange(m) if joint is None else np.concatenate([np.arange(0, m, -(-m // THIN_FRAMES)), joint.node])
+    kept = np.unique(every).astype(np.int64)
+    if joint is not None:
+        joint = replace(joint, node=np.searchsorted(kept, joint.node))
+    return kept, Course(replace(refinement, trajectory=refinement.trajectory.select(kept), joint=joint))
 
 
 def _marks(rows: Sequence[Row], number: Sequence[int], name: str, symbol: str, colour: str, unit: str,
@@ -91,14 +110,12 @@ def space_marks(rows: Sequence[Row], T_scene_world: Array, factor: float) -> lis
 
 def lesion_table(rows: Sequence[Row]) -> str:
     """All lesions and landmarks as an HTML table; every text in it is escaped."""
-    body = "".join(_table_row(number, row) for number, row in enumerate(rows, 1))
-    head = "".join(f"<th>{name}</th>" for name in (
-        "No.", "What", "Frame", "Time", "Along the gut [mm]", "From the nearest landmark [mm]", "% of path",
-        "% of time", "sd in space [mm]"))
+    body = [_table_row(number, row) for number, row in enumerate(rows, 1)]
+    head = ("No.", "What", "% of path", "% of time", "From the nearest landmark [mm]", "Along the gut [mm]", "Frame",
+            "Time", "sd in space [mm]")
     return ('<section class="lesions"><h2>Lesions and landmarks</h2><p class="caption">Along the travelled centreline '
             "from the first frame; in brackets 95 % intervals. A negative distance lies before the landmark. "
-            f"Numbers as in the figures.</p><table><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table>"
-            "</section>")
+            f"Numbers as in the figures.</p>{table(head, body)}</section>")
 
 
 def _table_row(number: int, row: Row) -> str:
@@ -108,9 +125,9 @@ def _table_row(number: int, row: Row) -> str:
     if row["nearest_landmark"] is not None:
         away += f" {row['nearest_landmark']}"
     sd = f"{NBSP}×{NBSP}".join(_figure(row[f"sd_{axis}_mm"]) for axis in ("major", "mid", "minor"))
-    cells = [str(row["frame"]), _clock(float(row["timestamp_s"])),
-             _interval(row, "arc_length_mm", "arc_lo_mm", "arc_hi_mm"), away,
-             _interval(row, "percent_path", "percent_path_lo", "percent_path_hi"), _figure(row["percent_time"]), sd]
+    cells = [_interval(row, "percent_path", "percent_path_lo", "percent_path_hi"), _figure(row["percent_time"]), away,
+             _interval(row, "arc_length_mm", "arc_lo_mm", "arc_hi_mm"), str(row["frame"]),
+             _clock(float(row["timestamp_s"])), sd]
     label = escape(what) + (f" <small>{escape(named)}</small>" if named else "")
     remark = "" if row["status"] == "ok" else f'<div class="remark">{escape(row["status"])}</div>'
     return (f'<tr><th>{number}</th><td class="label">{label}{remark}</td>'

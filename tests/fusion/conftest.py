@@ -1,12 +1,13 @@
 """Simulated examinations that the tests of fusion share; each is simulated and refined once."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from benchmarks.browser import Browser, browser, find_chromium
 from benchmarks.simulated_lesions import (
     SimulatedLesion,
     draw_lesions,
@@ -136,3 +137,12 @@ def case(examine: Callable, tmp_path_factory: pytest.TempPathFactory) -> LesionC
     folder = tmp_path_factory.mktemp("lesions") / "depth"
     write_depth(folder, made.simulation, network_depths(made.simulation, made.network, groups, DEPTH_SD, rng))
     return LesionCase(made.recording, refine(made.recording, made.motions), lesions, groups, folder)
+
+
+@pytest.fixture(scope="session")
+def tab() -> Iterator[Browser]:
+    """One tab of a headless Chromium."""
+    if find_chromium() is None:
+        pytest.skip("needs chromium (Debian: apt-get install chromium)")
+    with browser() as one:
+        yield one

@@ -1,6 +1,7 @@
 """Comparisons are fair: the same frames for all, the same alignment, and a loss is called a loss."""
 
 import json
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -8,9 +9,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from fusion import Provenance, RefineConfig, compare, compare_paths, format_table, write_run
+from fusion import Provenance, RefineConfig, compare, compare_paths, format_table, write_comparison, write_run
 from vio import se3
-from vio.errors import FormatError, TrajectoryError
+from vio.errors import FormatError, OutputError, TrajectoryError
 from vio.formats.tum import write_tum
 from vio.metrics import ate
 from vio.trajectory import Trajectory
@@ -131,6 +132,26 @@ def test_the_table_shows_every_alignment_and_how_much_was_matched():
     assert lines[3].startswith("50 of 60 frames matched")
 
 
+def test_chance_is_not_called_a_victory():
+    a, b = track(noise_m=1e-3, seed=1), track(noise_m=1e-3, seed=4)
+    result = compare({"chain": a, "graph": b}, TRUTH, [("chain", "graph")])
+    found = result.differences[0].under["se3"]
+    assert found.low_m < 0 < found.high_m and not found.significant
+    assert result.verdicts[0].startswith("graph does not differ significantly from chain: ATE ")
+    assert f"95 % interval {1e3 * found.low_m:+.2f} to {1e3 * found.high_m:+.2f} mm" in result.verdicts[0]
+
+
+def test_of_many_the_best_is_named_with_its_lead_over_the_next():
+    tracks = {name: track(noise_m=noise, seed=k) for k, (name, noise) in
+              enumerate((("a", 1e-3), ("b", 1e-4), ("c", 5e-4)))}
+    result = compare(tracks, TRUTH, [])
+    sentence, = result.verdicts
+    b, c = (1e3 * ate(tracks[name], TRUTH, "se3").rmse_m for name in "bc")
+    assert sentence.startswith(f"of 3: b wins, next is c: ATE {b:.2f} mm against {c:.2f} mm, SE3-aligned; difference ")
+    assert result.differences[0].under["se3"].difference_m * 1e3 == pytest.approx(b - c)
+    assert set(result.differences[0].under) == {"none", "origin", "yaw4", "se3", "sim3"}
+
+
 # ---- from files ------------------------------------------------------------------------------
 
 @pytest.fixture(scope="module")
@@ -149,9 +170,10 @@ def test_a_run_that_loses_is_told_so(runs, refined):
     result = compare_paths([runs / "good", runs / "bad"], None)
     assert list(result.rows) == ["good: motions only", "good: refined", "bad: motions only", "bad: refined"]
     assert result.frames == 300
-    good, bad = result.verdicts
+    good, bad, best = result.verdicts
     assert good.startswith("good: refined beats good: motions only")
     assert bad.startswith("bad: refined LOSES to bad: motions only")
+    assert best.startswith("of 4: bad: motions only and good: refined tie") or "good: refined and bad: motions" in best
     expected = ate(refined.trajectory, refined.truth, "se3").rmse_m
     assert result.rows["good: refined"]["se3"]["ate_rmse_m"] == pytest.approx(expected, rel=1e-6)
 
@@ -166,7 +188,7 @@ def test_files_and_runs_stand_side_by_side(runs, refined, tmp_path):
     assert result.frames == result.truth_frames == 100
     assert len(result.rows) == 6 and {"orb", "orb (2)"} <= set(result.rows)
     assert result.rows["orb"]["none"]["ate_rmse_m"] < 1e-9
-    assert len(result.verdicts) == 2
+    assert len(result.verdicts) == 3 and result.verdicts[2].startswith("of 6: orb and orb (2) tie for the first")
 
 
 def test_without_any_truth_the_remedy_is_named(runs, refined, tmp_path):
@@ -175,3 +197,58 @@ def test_without_any_truth_the_remedy_is_named(runs, refined, tmp_path):
         compare_paths([tmp_path / "a.tum"], None)
     with pytest.raises(FormatError, match=r"no summary\.json"):
         compare_paths([tmp_path], None)
+
+
+def test_what_is_written_gives_evo_the_same_numbers(runs, refined, tmp_path):
+    """evo reads the exports, aligns them itself, and finds the table's figures."""
+    from evo.core import metrics, trajectory
+    from evo.tools import file_interface
+
+    write_tum(part(refined.motions_only, range(10, 250)), tmp_path / "=1+1 <b>.tum")
+    comparison = compare_paths([runs / "good", tmp_path / "=1+1 <b>.tum"], None)
+    folder = write_comparison(comparison, tmp_path / "OUT")
+    content = json.loads((folder / "comparison.json").read_text())
+    assert (folder / "table.txt").read_text() == format_table(comparison) + "\n"
+    assert set(content["files"]) == set(comparison.rows) and len(list(folder.iterdir())) == 2 + 1 + 3
+    for name, files in content["files"].items():
+        assert re.fullmatch(r"[A-Za-z0-9._-]+\.tum", files["estimate"])
+        truth = file_interface.read_tum_trajectory_file(folder / files["truth"])
+        for mode, correct_scale in (("se3", False), ("sim3", True)):
+            estimate = file_interface.read_tum_trajectory_file(folder / files["estimate"])
+            estimate.align(truth, correct_scale=correct_scale)
+            ape = metrics.APE(metrics.PoseRelation.translation_part)
+            ape.process_data((truth, estimate))
+            assert isinstance(truth, trajectory.PoseTrajectory3D) and truth.num_poses == 240
+            assert ape.get_statistic(metrics.StatisticsType.rmse) == pytest.approx(
+                content["accuracy"][name][mode]["ate_rmse_m"], rel=1e-6)
+    write_comparison(comparison, folder)  # ours: replaced
+    with pytest.raises(OutputError, match="choose another --out"):
+        write_comparison(comparison, runs)
+
+
+def moved(refined, metres):
+    """An examination with another truth: everything lies somewhere else."""
+    away = se3.transform(np.eye(3), [metres, 0, metres])
+    shift = {name: replace(getattr(refined, name), T_world_body=away @ getattr(refined, name).T_world_body)
+             for name in ("trajectory", "motions_only", "truth")}
+    return replace(refined, **shift)
+
+
+def test_runs_of_several_recordings_are_judged_by_their_own_truth(runs, refined, tmp_path):
+    for k in range(5):
+        write_run(moved(refined, 0.1 * k), tmp_path / f"run{k}", Provenance(["refine"], RefineConfig(), {}))
+    folders = [tmp_path / f"run{k}" for k in range(5)]
+    result = compare_paths(folders, None)
+    own = ate(refined.trajectory, refined.truth, "none").rmse_m
+    for k in range(5):
+        assert result.rows[f"run{k}: refined"]["none"]["ate_rmse_m"] == pytest.approx(own, rel=1e-6)
+    assert result.over.better == result.over.recordings == 5 and result.over.high < 1
+    assert result.verdicts[-1].startswith("over 5 recordings: refined leaves 0.")
+    assert result.frames == 5 * 300
+    few = compare_paths(folders[:2], None)
+    assert few.over.low is None and "5 recordings are needed for an interval" in few.verdicts[-1]
+    files = json.loads((write_comparison(few, tmp_path / "OUT") / "comparison.json").read_text())["files"]
+    assert {entry["truth"] for entry in files.values()} == {"truth.tum", "truth_2.tum"}
+    write_tum(refined.trajectory, tmp_path / "a.tum")
+    with pytest.raises(TrajectoryError, match="2 recordings, and a does not say of which one"):
+        compare_paths([*folders[:2], tmp_path / "a.tum"], None)

@@ -10,7 +10,7 @@ import pytest
 
 from fusion import LesionTable, Sighting, locate, write_lesions
 from fusion.lesions.table import COLUMNS
-from vio.errors import LesionError, VioError
+from vio.errors import LesionError, RecordingError, VioError
 
 # ---- outputs ---------------------------------------------------------------------------------
 
@@ -94,7 +94,7 @@ def test_a_time_in_a_hole_between_frames_shows_nothing(case):
 
 def test_another_recording_is_refused(case, examine):
     other = examine("colon", "none", 0, 12.0, 3).recording
-    with pytest.raises(LesionError, match="does not have the frames of the trajectory"):
+    with pytest.raises(RecordingError, match="does not have the frames of the trajectory"):
         locate(case.refined, [Sighting("x", "finding", 3, None, None, "x")], recording=other)
 
 

@@ -3,7 +3,6 @@
 import json
 import re
 import shutil
-import subprocess
 from pathlib import Path
 
 import numpy as np
@@ -136,18 +135,11 @@ def test_damaged_lesions_are_refused(tmp_path, text):
 
 
 @pytest.mark.parametrize("scheme", ["light", "dark"])
-def test_a_browser_draws_the_unrolled_gut(run, tmp_path, scheme):
+def test_a_browser_draws_the_unrolled_gut(run, tab, scheme):
     """Rendered marks, not only text: points with their bars, and no dialogue from a label."""
-    chromium = shutil.which("chromium")
-    if chromium is None:
-        pytest.skip("needs chromium")
-    command = [chromium, "--headless", "--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run",
-               "--disable-background-networking", "--disable-component-update", "--disable-sync",
-               f"--user-data-dir={tmp_path / 'profile'}", "--virtual-time-budget=15000", "--dump-dom",
-               f"--blink-settings=preferredColorScheme={int(scheme == 'light')}", f"file://{run / 'report.html'}"]
-    dom = subprocess.run(command, capture_output=True, text=True, check=False, timeout=180).stdout
-    drawn = dom.split('id="unrolled"', 1)[1].split("</figure>")[0]
-    assert len(re.findall(r'class="point ', drawn)) == 4
-    assert len(re.findall(r'class="yerror"', drawn)) == 4
+    tab.show(run / "report.html", scheme=scheme)
+    tab.ask("window.reportDrawn ?? new Promise(done => addEventListener('load', () => done(window.reportDrawn)))")
+    assert tab.ask("document.querySelectorAll('#unrolled .point').length") == 4
+    assert tab.ask("document.querySelectorAll('#unrolled .yerror').length") == 4
     colour = {"light": "rgb(179, 38, 122)", "dark": "rgb(255, 143, 208)"}[scheme]
-    assert colour in drawn
+    assert tab.ask("getComputedStyle(document.querySelector('#unrolled .point')).fill") == colour

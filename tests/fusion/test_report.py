@@ -214,7 +214,7 @@ def test_a_straight_track_still_gets_its_report(tmp_path: Path) -> None:
 def test_without_truth_and_covariance(tmp_path: Path) -> None:
     r = refinement_of(truth=None)
     page, drawn = page_of(replace(r, trajectory=replace(r.trajectory, cov=None)), tmp_path)
-    assert set(drawn) == {"trajectory", "scale", "gyro", "accel"} and "no truth" in page.text
+    assert set(drawn) == {"trajectory", "speed", "scale", "gyro", "accel"} and "no truth" in page.text
     assert "table" not in [tag for tag, _ in page.elements]
     write_trajectory_plot(r, tmp_path / "t.svg")
     assert "claimed 3 sigma" in (tmp_path / "t.svg").read_text()

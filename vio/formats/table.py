@@ -110,7 +110,8 @@ def parse_stamps(table: TextTable, error: type[VioError]) -> NDArray[np.int64]:
         try:
             stamps[k] = int(field)
         except (ValueError, OverflowError):
-            raise error(f"{table.at(k)}: stamp {field!r} is not a whole number of nanoseconds") from None
+            raise error(f"{table.at(k)}: stamp {field[:40]!r} is not a whole number of nanoseconds; separate columns "
+                        "by commas and write stamps without a point") from None
     return check_increasing(stamps, table, error)
 
 
@@ -171,7 +172,8 @@ def check_quaternions(quaternions: Array, table: TextTable, error: type[VioError
     Raises:
         error: a length that is off by more than 1e-3, naming its line.
     """
-    length = np.linalg.norm(quaternions, axis=1)
+    with np.errstate(over="ignore"):  # infinite is not of unit length either
+        length = np.linalg.norm(quaternions, axis=1)
     bad = np.abs(length - 1) > QUATERNION_TOLERANCE
     if bad.any():
         row = int(np.argmax(bad))
