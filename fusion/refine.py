@@ -58,7 +58,8 @@ def _first_that_works(problem: Problem, motions: RelativeMotions, config: Refine
     reasons: list[str] = []
     if config.estimator in ("auto", "graph"):
         try:
-            return _sane(GraphEstimator(problem, config, stages).estimate(), "graph"), "graph", None
+            estimate = _sane(GraphEstimator(problem, config, stages).estimate(), "graph")
+            return estimate, "graph", "; ".join(estimate.notes) or None
         except EstimationError as error:
             if config.estimator == "graph":
                 raise
