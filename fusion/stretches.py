@@ -14,9 +14,9 @@ import numpy as np
 from fusion.problem import Problem
 from fusion.scale import GRAVITY_ONLY
 
-CONTRADICTED_CHI2 = 10.0
+CONTRADICTED_CHI2 = 2.0
 """Inertial chi² per degree of freedom (clean value about 0.5) of a stretch that cannot be right …"""
-CONTRADICTED_RATIO = 25.0
+CONTRADICTED_RATIO = 5.0
 """… when it is also this many times what the recording's other stretches have in the median."""
 LARGEST_SHARE = 1 / 3
 """Share of stretches beyond which the recording as a whole is at fault, and its policy must judge."""
@@ -59,7 +59,7 @@ def demoted(problem: Problem, bad: Sequence[Stretch], without_imu: bool) -> tupl
         else:
             inflation[cut] *= GRAVITY_ONLY
             what = "the accelerometer serves for the direction of gravity only"
-        why = stretch.reason or f"inertial chi² {stretch.imu_chi2:.0f} per dof"
+        why = stretch.reason or f"inertial chi² {stretch.imu_chi2:.1f} per dof"
         words.append(f"frames {problem.first_frame + stretch.first} to {problem.first_frame + stretch.last}: {what} "
                      f"({why})")
     return replace(problem, imu_usable=usable, accel_inflation=inflation), words

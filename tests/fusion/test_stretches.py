@@ -48,7 +48,7 @@ def test_only_the_stretch_falls_back(long, chunked, clean_ate_m, sensor, change,
     recording = spoiled(long.recording, sensor, 112.0, 145.0, change)
     refined = refine(recording, long.motions, chunked)
     assert refined.estimator == "graph" and refined.scale.policy == "free" and refined.imu.inflation == 1.0
-    assert f"frames 300 to 450: {words} (inertial chi²" in refined.fallback_reason
+    assert f"frames 300 to 450: {words}" in refined.fallback_reason
     assert "frames 0 to" not in refined.fallback_reason
     truth = long.recording.truth_at_frames()
     alone = ate(refined.motions_only, truth, "se3").rmse_m
@@ -77,7 +77,7 @@ def test_a_majority_is_the_policys_business():
     assert contradicted([good, good, good, bad]) == [bad]
     assert contradicted([good, bad, bad]) == [] and contradicted([]) == [] and contradicted([good]) == []
     assert contradicted([good, good, good, Stretch(0, 1, np.inf, "x")])[0].reason == "x"
-    assert contradicted([Stretch(0, 1, 3.0)] * 5 + [Stretch(1, 2, 60.0)]) == []  # 20 times the others
+    assert contradicted([Stretch(0, 1, 3.0)] * 5 + [Stretch(1, 2, 12.0)]) == []  # four times the others
 
 
 def test_where_the_chain_fails_gtsam_solves(long, monkeypatch, configured):
