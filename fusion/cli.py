@@ -10,14 +10,20 @@ from __future__ import annotations
 import argparse
 import json
 import sys
+import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from typing import Any
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 from tqdm import tqdm
 
 from fusion.cli_parser import build_parser
 from vio.errors import UsageError, VioError
+
+if TYPE_CHECKING:
+    from vio.motions import RelativeMotions
+    from vio.recording import Recording
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -34,14 +40,15 @@ def main(argv: Sequence[str] | None = None) -> int:
         print(f"capsule-vio {arguments.command}: {error}", file=sys.stderr)
         return error.exit_code
     except KeyboardInterrupt:
-        print("interrupted; nothing half-written was kept", file=sys.stderr)
+        print("interrupted; nothing half-written was kept; refine goes on where it stopped", file=sys.stderr)
         return 130
 
 
 class _Progress:
     """Stages on stderr: a line that rewrites itself on a terminal, plain lines otherwise."""
 
-    def __init__(self) -> None:
+    def __init__(self, remaining: Callable[[str, float], float | None] | None = None) -> None:
+        self.remaining, self.begun = remaining, time.monotonic()
         self.bar = tqdm(bar_format="{desc} {elapsed}", leave=False, disable=not sys.stderr.isatty())
 
     def __enter__(self) -> _Progress:
@@ -52,7 +59,8 @@ class _Progress:
 
     def __call__(self, stage: str) -> None:
         """Announce a stage."""
-        text = f"… {stage.replace('_', ' ')}"
+        left = None if self.remaining is None else self.remaining(stage, time.monotonic() - self.begun)
+        text = f"… {stage.replace('_', ' ')}" + (f", about {left:.0f} s left" if left is not None and left > 1 else "")
         if self.bar.disable:
             print(text, file=sys.stderr, flush=True)
         else:
@@ -222,36 +230,54 @@ def _predict(arguments: argparse.Namespace) -> int:
 
 
 def _refine(arguments: argparse.Namespace) -> int:
+    from fusion.checkpoint import unfinished
     from fusion.config import RefineConfig, load_config
     from fusion.refine import refine
     from fusion.run_folder import Provenance, write_run
+    from fusion.stages import remaining_s
     from vio.formats import open_recording
-    from vio.motions import load_motions
 
     config = RefineConfig() if arguments.config is None else load_config(arguments.config)
     if arguments.estimator is not None:
         config = replace(config, estimator=arguments.estimator)
     recording = open_recording(arguments.recording)
     inputs = {"imu": arguments.recording / "mav0" / "imu0" / "data.csv",
-              "frames": arguments.recording / "mav0" / "cam0" / "data.csv"}
-    if arguments.motions is not None:
-        motions = load_motions(arguments.motions)
-        inputs["motions"] = arguments.motions
-    else:
-        import learned
-
-        motions = learned.predict(recording, arguments.weights)
-    inputs = {name: path for name, path in inputs.items() if path.is_file()}
-    with _Progress() as progress:
-        refined = refine(recording, motions, config, progress)
+              "frames": arguments.recording / "mav0" / "cam0" / "data.csv", "motions": arguments.motions}
+    inputs = {name: path for name, path in inputs.items() if path is not None and path.is_file()}
     command = ["refine", arguments.recording.name, "--out", arguments.out.name]
-    summary = write_run(refined, arguments.out, Provenance(command, config, inputs), motions)
+    with unfinished(arguments.out) as kept:
+        motions = _motions(arguments, recording, inputs, kept)
+        with _Progress(remaining_s) as progress:
+            refined = refine(recording, motions, config, progress, kept / "graph")
+            progress("run_folder")
+            summary = write_run(refined, arguments.out, Provenance(command, config, inputs), motions)
     if arguments.json:
         _print_json(summary)
     else:
         print(_sentences(summary))
         print(f"run folder: {arguments.out}")
     return 0
+
+
+def _motions(arguments: argparse.Namespace, recording: Recording, inputs: dict[str, Path],
+             kept: Path) -> RelativeMotions:
+    """The motions that were given, or measured by the network and kept until the run is written."""
+    from fusion.checkpoint import Checkpoint, digest
+    from fusion.run_folder import sha256_of
+    from vio.motions import load_motions
+
+    if arguments.motions is not None:
+        return load_motions(arguments.motions)
+    import learned
+
+    weights = "bundled" if arguments.weights is None else sha256_of(arguments.weights)
+    images = [f"{path.name} {path.stat().st_mtime_ns}" for path in recording.frame_paths if path is not None]
+    key = digest(text.encode() for text in (weights, *map(sha256_of, inputs.values()), *images))
+    stored = Checkpoint(kept / "prediction", key).folder / "motions.npz"
+    if not stored.is_file():
+        with _Progress() as progress:
+            learned.predict(recording, arguments.weights, progress=progress.count).save(stored)
+    return load_motions(stored)
 
 
 def _sentences(summary: dict[str, Any]) -> str:

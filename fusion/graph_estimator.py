@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from fusion import scale as scale_policy
 from fusion.chain_engine import ChainEngine
+from fusion.checkpoint import Checkpoint, ResumableEngine
 from fusion.config import RefineConfig
 from fusion.engine import Begin, Engine, Uncertainty
 from fusion.estimate import Estimate, add_scale_uncertainty
@@ -53,9 +54,12 @@ class _Pass:
 class GraphEstimator:
     """Solves one problem; holds what the passes share."""
 
-    def __init__(self, problem: Problem, config: RefineConfig, stages: Stages) -> None:
+    def __init__(self, problem: Problem, config: RefineConfig, stages: Stages,
+                 checkpoint: Checkpoint | None = None) -> None:
         self.problem, self.config, self.stages = problem, config, stages
-        self.engine: Engine = ChainEngine() if ChainEngine.suits(problem) else NativeEngine()
+        self.engine: Engine = NativeEngine()
+        if ChainEngine.suits(problem):
+            self.engine = ChainEngine() if checkpoint is None else ResumableEngine(ChainEngine(), checkpoint)
         self.notes: list[str] = []
         self.segments: Segments = scale_policy.make_segments(problem.t_s, config.scale.segment_s)
 
