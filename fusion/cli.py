@@ -232,9 +232,11 @@ def _predict(arguments: argparse.Namespace) -> int:
 def _refine(arguments: argparse.Namespace) -> int:
     from fusion.checkpoint import unfinished
     from fusion.config import RefineConfig, load_config
+    from fusion.online_run import online_refine
     from fusion.refine import refine
     from fusion.run_folder import Provenance, write_run
     from fusion.stages import remaining_s
+    from fusion.summary import sentences
     from vio.formats import open_recording
 
     config = RefineConfig() if arguments.config is None else load_config(arguments.config)
@@ -248,13 +250,16 @@ def _refine(arguments: argparse.Namespace) -> int:
     with unfinished(arguments.out) as kept:
         motions = _motions(arguments, recording, inputs, kept)
         with _Progress(remaining_s) as progress:
-            refined = refine(recording, motions, config, progress, kept / "graph")
+            if arguments.online:
+                refined = online_refine(recording, motions, config, arguments.lag, progress.count)
+            else:
+                refined = refine(recording, motions, config, progress, kept / "graph")
             progress("run_folder")
             summary = write_run(refined, arguments.out, Provenance(command, config, inputs), motions)
     if arguments.json:
         _print_json(summary)
     else:
-        print(_sentences(summary))
+        print(sentences(summary))
         print(f"run folder: {arguments.out}")
     return 0
 
@@ -278,21 +283,6 @@ def _motions(arguments: argparse.Namespace, recording: Recording, inputs: dict[s
         with _Progress() as progress:
             learned.predict(recording, arguments.weights, progress=progress.count).save(stored)
     return load_motions(stored)
-
-
-def _sentences(summary: dict[str, Any]) -> str:
-    from fusion.compare import verdict
-
-    scale, fallback = summary["scale"], summary["fallback_reason"]
-    lines = [
-        f"estimator: {summary['estimator']}" + (f" (fell back: {fallback})" if fallback else ""),
-        f"{summary['frames']} frames, {summary['duration_s']:.1f} s, path {summary['path_length_m']:.4f} m",
-        f"scale: {scale['policy']} – {scale['reason']}",
-        f"motions: {summary['motions']['used']} used, {summary['motions']['rejected']} rejected",
-    ]
-    if "accuracy" in summary:
-        lines.append(verdict(summary["accuracy"]["motions"], summary["accuracy"]["refined"]))
-    return "\n".join(lines)
 
 
 def _compare(arguments: argparse.Namespace) -> int:

@@ -55,7 +55,7 @@ def refine(recording: Recording, motions: RelativeMotions, config: RefineConfig 
         problem = build_problem(recording, motions)
     checkpoint = None if resume is None else Checkpoint(resume, refinement_key(recording, motions, config))
     estimate, estimator, reason = _first_that_works(problem, motions, config, stages, checkpoint)
-    return _conclude(recording, motions, problem, estimate, estimator, reason, stages)
+    return conclude(recording, motions, problem, estimate, estimator, reason, stages)
 
 
 def _first_that_works(problem: Problem, motions: RelativeMotions, config: RefineConfig, stages: Stages,
@@ -100,8 +100,9 @@ def _sane(estimate: Estimate, name: str) -> Estimate:
     return estimate
 
 
-def _conclude(recording: Recording, motions: RelativeMotions, problem: Problem, estimate: Estimate,
-              estimator: Estimator, reason: str | None, stages: Stages) -> Refinement:
+def conclude(recording: Recording, motions: RelativeMotions, problem: Problem, estimate: Estimate,
+             estimator: Estimator, reason: str | None, stages: Stages) -> Refinement:
+    """A refinement from an estimate: beside the motions alone, with truth where there is any."""
     times = problem.t_s
     only, bridged = chain_motions(motions, times, problem.motions.T_body_camera, estimate.T_world_body[0])
     return Refinement(
