@@ -87,9 +87,13 @@ def test_chained_motions_have_samples_too(short, many):
         check_covariance(found.joint.xi[:, k], found.cov[k])
 
 
-def test_a_graph_too_wide_for_a_band_has_none(short, configured, on_gtsam, monkeypatch):
+@pytest.mark.parametrize("policy", ["free", "fixed"])
+def test_a_graph_too_wide_for_a_band_is_sampled_by_gtsam(short, configured, many, on_gtsam, monkeypatch, policy):
     monkeypatch.setattr(joint_graph, "LARGEST_BAND", 100)
-    assert refine(short.recording, short.motions, configured(estimator="graph")).joint is None
+    refined = refine(short.recording, short.motions, configured(estimator="graph", scale=ScaleConfig(policy=policy)))
+    for k in (5, 20, 35):
+        check_covariance(refined.joint.xi[:, k], refined.trajectory.cov[k])
+    assert refined.joint.log_scale[:, 9].std() == pytest.approx(refined.log_scale_sd[9], rel=0.05)
 
 
 def test_between_checkpoints_errors_are_interpolated(monkeypatch):
