@@ -42,21 +42,30 @@ class ChainSystem:
 
     The band's column c holds H[c : c + width, c]. A block of `reach` frames and the next one are a window; seen
     through strides, entry (block, column, row) of that window lies at its place in the band. Only rows at or below
-    their column exist: what is added to a frame's own block goes in without its upper triangle.
+    their column exist: what is added to a frame's own block goes in without its upper triangle. No factor joins a
+    frame with the biases of a later one, apart from the links of neighbours, which keeps the band as narrow as it is.
     """
 
     def __init__(self, nodes: int, reach: int) -> None:
         self.nodes, self.reach = nodes, max(reach, 1)
         self.blocks = -(-nodes // self.reach)
         self.side = DIM * self.reach
-        width = 2 * self.side
+        width = self.side + BIAS.start
         self.band = np.zeros((self.blocks * self.side, width))
         size = self.band.itemsize
         self._window = as_strided(self.band, (self.blocks, self.reach, DIM, 2 * self.reach, DIM),
                                   tuple(size * s for s in (self.side * width, DIM * (width - 1), width - 1, DIM, 1)))
         self.gradient = np.zeros((self.blocks * self.reach, DIM))
-        self.gradient_view = self.gradient[:nodes]
-        self.band[nodes * DIM:, 0] = 1.0  # frames that only fill the last block
+        self._fill_up()
+
+    def clear(self) -> None:
+        """Forget all factors; the memory stays."""
+        self.band.fill(0.0)
+        self.gradient.fill(0.0)
+        self._fill_up()
+
+    def _fill_up(self) -> None:
+        self.band[self.nodes * DIM:, 0] = 1.0  # frames that only fill the last block
 
     def add(self, i: Nodes, j: Nodes, first: tuple[slice, Array], second: tuple[slice, Array], b: Array) -> None:
         """Add factors |A_i x_i + A_j x_j - b|² between frames with 0 < j - i ≤ reach, each unique in `i` and in `j`.
@@ -65,7 +74,7 @@ class ChainSystem:
             i: (N,) first frames, or a slice of them (then `j` is the slice one further, and frames make no blocks).
             j: (N,) second frames.
             first: which unknowns of the first frames, and A_i (N, r, n).
-            second: which unknowns of the second frames, and A_j (N, r, m).
+            second: which unknowns of the second frames, none of them a bias, and A_j (N, r, m).
             b: (N, r)
         """
         (rows_i, A_i), (rows_j, A_j) = first, second
@@ -127,7 +136,7 @@ class ChainFactor:
 
     system: ChainSystem
     band: Array
-    """(blocks · side, 2 · side) lower band of L, by columns."""
+    """(blocks · side, width) lower band of L, by columns."""
 
     def solve(self) -> Array:
         """The (M, 16) solution of the normal equations."""
@@ -140,17 +149,16 @@ class ChainFactor:
         """C^½ (K, side, side), upper triangular, and -Gᵀ (K, side, side) of all blocks."""
         side, K = self.system.side, self.system.blocks
         flat = self.band.reshape(-1)
-        size, width = flat.itemsize, 2 * side
+        size, width = flat.itemsize, self.band.shape[1]
         columns = as_strided(flat, (K, side, side), (size * side * width, size * (width - 1), size))
-        # The last block's lower half lies beyond the memory: it has no successor.
         below = as_strided(flat[side:], (K - 1, side, side), (size * side * width, size * (width - 1), size))
-        mask = np.tri(side).T
+        mask, reached = np.tri(side).T, np.tri(side, side, width - 1 - side)  # by column, then row
         root, carry = np.empty((K, side, side)), np.zeros((K, side, side))
         for first, last in spans(K, max(1, BLOCK_NODES // self.system.reach)):
             inverse_t = np.linalg.inv(columns[first:last] * mask)  # the transpose of L_kk⁻¹
             root[first:last] = inverse_t
             stop = min(last, K - 1)
-            carry[first:stop] = -inverse_t[:stop - first] @ below[first:stop]
+            carry[first:stop] = -inverse_t[:stop - first] @ (below[first:stop] * reached)
         return root, carry
 
     def marginals_and_samples(self, rng: np.random.Generator) -> tuple[Array, JointSamples]:

@@ -75,10 +75,12 @@ class ChainModel:
             total += 0.5 * float(((np.diff(state.log_scale) / self.scale.step_sd) ** 2).sum())
         return total
 
-    def linearize(self, state: ChainState, term: MotionTerm) -> ChainSystem:
-        """Normal equations of all factors and the motions at `state`."""
+    def linearize(self, state: ChainState, term: MotionTerm, memory: ChainSystem | None = None) -> ChainSystem:
+        """Normal equations of all factors and the motions at `state`, in the memory of an earlier one if given."""
         reach = int((term.motions.j - term.motions.i).max(initial=1))
-        system = ChainSystem(self.nodes, reach)
+        system = memory or ChainSystem(self.nodes, reach)
+        if memory is not None:
+            memory.clear()
         for first, last in spans(len(self.steps), BLOCK_NODES):
             A_i, A_j, b = self._inertial(state, first, last)
             system.add(*_pair(first, last, reach), (FIRST, A_i), (SECOND, A_j), b)

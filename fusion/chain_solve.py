@@ -18,11 +18,12 @@ def chain_gauss_newton(model: ChainModel, state: ChainState, term: MotionTerm, m
         EstimationError: the cost is not finite, or a linear system is indeterminate.
     """
     here = _Evaluated(model, state, term)
-    iterations = 0
+    iterations, system = 0, None
     while iterations < max_iterations:
         if not np.isfinite(here.cost):
             raise EstimationError(f"graph: the cost is {here.cost} after {iterations} iterations")
-        delta = model.linearize(here.state, term).factor().solve()
+        system = model.linearize(here.state, term, system)
+        delta = system.factor().solve()
         moved = _line_search(model, here, term, delta)
         iterations += 1
         if moved is None:

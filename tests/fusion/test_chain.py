@@ -156,13 +156,13 @@ def test_solution_and_marginals_equal_dense_algebra(seed, nodes, reach, stops):
     dense, gradient = np.zeros(2 * [nodes * DIM]), np.zeros(nodes * DIM)
     for span in range(1, min(reach, nodes - 1) + 1):
         i = np.arange(nodes - span)
-        A_i, A_j = rng.standard_normal((len(i), 9, 7)), rng.standard_normal((len(i), 9, DIM))
+        A_i, A_j = rng.standard_normal((len(i), 9, DIM)), rng.standard_normal((len(i), 9, 10))
         b = rng.random((len(i), 9))
         pair = (slice(0, nodes - 1), slice(1, nodes)) if reach == 1 else (i, i + span)
-        system.add(*pair, (slice(0, 7), A_i), (slice(0, DIM), A_j), b)
+        system.add(*pair, (slice(0, DIM), A_i), (slice(0, 10), A_j), b)
         for k in i:
             A = np.zeros((9, nodes * DIM))
-            A[:, k * DIM:k * DIM + 7], A[:, (k + span) * DIM:(k + span + 1) * DIM] = A_i[k], A_j[k]
+            A[:, k * DIM:(k + 1) * DIM], A[:, (k + span) * DIM:(k + span) * DIM + 10] = A_i[k], A_j[k]
             dense += A.T @ A
             gradient += A.T @ b[k]
     information, wanted = rng.uniform(1, 2, (nodes - 1, 6)), rng.standard_normal((nodes - 1, 6))
