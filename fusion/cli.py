@@ -12,11 +12,16 @@ import json
 import sys
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from typing import Any
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 from fusion.cli_parser import build_parser
 from fusion.cli_progress import Progress
 from vio.errors import UsageError, VioError
+
+if TYPE_CHECKING:
+    from vio.motions import RelativeMotions
+    from vio.recording import Recording
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -33,7 +38,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         print(f"capsule-vio {arguments.command}: {_one_line(error)}", file=sys.stderr)
         return error.exit_code
     except KeyboardInterrupt:
-        print("interrupted; nothing half-written was kept", file=sys.stderr)
+        print("interrupted; nothing half-written was kept; refine goes on where it stopped", file=sys.stderr)
         return 130
 
 
@@ -206,52 +211,62 @@ def _predict(arguments: argparse.Namespace) -> int:
 
 
 def _refine(arguments: argparse.Namespace) -> int:
+    from fusion.checkpoint import unfinished
     from fusion.config import RefineConfig, load_config
+    from fusion.online_run import online_refine
     from fusion.refine import refine
     from fusion.run_folder import Provenance, write_run
+    from fusion.stages import remaining_s
+    from fusion.summary import sentences
     from vio.formats import open_recording
-    from vio.motions import load_motions
 
     config = RefineConfig() if arguments.config is None else load_config(arguments.config)
     if arguments.estimator is not None:
         config = replace(config, estimator=arguments.estimator)
     recording = open_recording(arguments.recording)
     inputs = {"imu": arguments.recording / "mav0" / "imu0" / "data.csv",
-              "frames": arguments.recording / "mav0" / "cam0" / "data.csv"}
-    if arguments.motions is not None:
-        motions = load_motions(arguments.motions)
-        inputs["motions"] = arguments.motions
-    else:
-        import learned
-
-        motions = learned.predict(recording, arguments.weights)
-    inputs = {name: path for name, path in inputs.items() if path.is_file()}
-    with Progress() as progress:
-        refined = refine(recording, motions, config, progress)
-    # What people call their files may be a patient's name: a run is named after the folder it is written to.
-    refined, command = replace(refined, name=arguments.out.resolve().name), ["refine", "REC", "--out", "RUN"]
-    summary = write_run(refined, arguments.out, Provenance(command, config, inputs), motions)
+              "frames": arguments.recording / "mav0" / "cam0" / "data.csv", "motions": arguments.motions}
+    inputs = {name: path for name, path in inputs.items() if path is not None and path.is_file()}
+    with unfinished(arguments.out) as kept:
+        motions = _motions(arguments, recording, inputs, kept)
+        with Progress(remaining_s) as progress:
+            if arguments.online:
+                refined = online_refine(recording, motions, config, arguments.lag, progress.count)
+            else:
+                refined = refine(recording, motions, config, progress, kept / "graph")
+            # What people call their files may be a patient's name: a run is named after the folder it is written to.
+            refined = replace(refined, name=arguments.out.resolve().name)
+            progress("run_folder")
+            provenance = Provenance(["refine", "REC", "--out", "RUN"], config, inputs)
+            summary = write_run(refined, arguments.out, provenance, motions)
     if arguments.json:
         _print_json(summary)
     else:
-        print(_sentences(summary))
+        print(sentences(summary))
         print(f"run folder: {arguments.out}")
     return 0
 
 
-def _sentences(summary: dict[str, Any]) -> str:
-    from fusion.compare_text import verdict
+def _motions(arguments: argparse.Namespace, recording: Recording, inputs: dict[str, Path],
+             kept: Path) -> RelativeMotions:
+    """The motions that were given, or measured by the network and kept until the run is written."""
+    from fusion.checkpoint import Checkpoint, digest
+    from fusion.run_folder import sha256_of
+    from vio.motions import load_motions
 
-    scale, fallback = summary["scale"], summary["fallback_reason"]
-    lines = [
-        f"estimator: {summary['estimator']}" + (f" (fell back: {fallback})" if fallback else ""),
-        f"{summary['frames']} frames, {summary['duration_s']:.1f} s, path {summary['path_length_m']:.4f} m",
-        f"scale: {scale['policy']} – {scale['reason']}",
-        f"motions: {summary['motions']['used']} used, {summary['motions']['rejected']} rejected",
-    ]
-    if "accuracy" in summary:
-        lines.append(verdict(summary["accuracy"]["motions"], summary["accuracy"]["refined"]))
-    return "\n".join(lines)
+    if arguments.motions is not None:
+        return load_motions(arguments.motions)
+    import learned
+
+    weights = "bundled" if arguments.weights is None else sha256_of(arguments.weights)
+    images = [f"{path.name} {path.stat().st_mtime_ns}" for path in recording.frame_paths if path is not None]
+    key = digest(text.encode() for text in (weights, *map(sha256_of, inputs.values()), *images))
+    stored = Checkpoint(kept / "prediction", key).folder / "motions.npz"
+    if not stored.is_file():
+        with Progress() as progress:
+            learned.predict(recording, arguments.weights, unfinished=kept / "pairs",
+                            progress=progress.count).save(stored)
+    return load_motions(stored)
 
 
 def _compare(arguments: argparse.Namespace) -> int:

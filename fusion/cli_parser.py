@@ -167,7 +167,11 @@ def _refine(commands: Commands) -> None:
     source = parser.add_mutually_exclusive_group()
     source.add_argument("--motions", type=Path, metavar="motions.npz", help="motions from any source")
     source.add_argument("--weights", type=Path, metavar="W", help="predict the motions with these weights")
-    parser.add_argument("--estimator", choices=("auto", "graph", "ekf"), help="default: the configuration's, auto")
+    how = parser.add_mutually_exclusive_group()
+    how.add_argument("--estimator", choices=("auto", "graph", "ekf"), help="default: the configuration's, auto")
+    how.add_argument("--online", action="store_true", help="frame by frame, as for a live capsule")
+    parser.add_argument("--lag", type=float, default=30.0, metavar="S",
+                        help="how long a frame stays open to correction online (default: 30 s)")
     parser.add_argument("--config", type=Path, metavar="c.yaml")
     parser.add_argument("--out", type=Path, required=True, metavar="RUN")
     _json(parser)

@@ -3,14 +3,21 @@
 from __future__ import annotations
 
 import sys
+import time
+from collections.abc import Callable
 
 from tqdm import tqdm
 
 
 class Progress:
-    """Stages, and how much of a known total is done."""
+    """Stages, and how much of a known total is done.
 
-    def __init__(self) -> None:
+    Args:
+        remaining: seconds left when a stage begins, from its name and the seconds since the beginning; None = unknown.
+    """
+
+    def __init__(self, remaining: Callable[[str, float], float | None] | None = None) -> None:
+        self.remaining, self.begun = remaining, time.monotonic()
         self.bar = tqdm(bar_format="{desc} {elapsed}", leave=False, disable=not sys.stderr.isatty())
 
     def __enter__(self) -> Progress:
@@ -21,7 +28,8 @@ class Progress:
 
     def __call__(self, stage: str) -> None:
         """Announce a stage."""
-        text = f"… {stage.replace('_', ' ')}"
+        left = None if self.remaining is None else self.remaining(stage, time.monotonic() - self.begun)
+        text = f"… {stage.replace('_', ' ')}" + (f", about {left:.0f} s left" if left is not None and left > 1 else "")
         if self.bar.disable:
             sys.stderr.write(f"{text}\n")
             sys.stderr.flush()

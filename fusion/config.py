@@ -43,7 +43,7 @@ class SolverConfig:
     chunk_frames: int = 1500
     overlap_frames: int = 90
     max_iterations: int = 25
-    relative_tolerance: float = 1e-6
+    relative_tolerance: float = 1e-5
 
 
 @dataclass(frozen=True)

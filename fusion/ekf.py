@@ -7,6 +7,9 @@ The rotation error is in the world frame: R = Exp(theta) R_hat.
 
 Beside the filter, a bundle of sampled errors goes through the same steps: how the errors of all poses hang together.
 
+There is no backward pass: a Rauch-Tung-Striebel smoother over the error state changed the aligned error by at most 1 %
+(8 runs of 1000 frames, levels 1 and 5, scale exact: 1.73-2.33 mm filtered, 1.71-2.31 mm smoothed) for twice the work.
+
 Outliers inflate R and are never refused outright: a hard gate that once loses track refuses everything
 after. Scale is not estimated: an EKF's free scale is biased and overconfident.
 """
@@ -33,6 +36,8 @@ ROT, VEL, POS, BG, BA, CLONE_ROT, CLONE_POS = (slice(i, i + 3) for i in range(0,
 CHI2_6_99, CHI2_6_999 = 16.8, 22.5
 GAP_VELOCITY_SD_M_S_RTS, GAP_RATE_SD_RAD_RTS = 0.05, 1.0
 """Random walks of velocity and attitude where the IMU is missing."""
+STARTING_STEPS = 3
+"""Steps whose median is the first velocity: a filter that starts from rest at speed bends its first steps."""
 LOST_SHARE = 0.5
 """Share of motions that may look like outliers; beyond it the filter follows the IMU alone, wherever that leads."""
 GRAVITY_WORLD = np.array([0.0, 0.0, -GRAVITY_M_S2])
@@ -164,6 +169,19 @@ class _CapsuleEkf:
         return np.concatenate([self.errors[:, ROT] @ self.R, self.errors[:, POS] @ self.R], axis=1)
 
 
+def starting_velocity(problem: Problem, R_world_body_first: Array) -> Array:
+    """(3,) velocity of the first node in the world: the median over the first measured steps, for outliers' sake."""
+    surest = problem.motions.surest_neighbours(len(problem))[:STARTING_STEPS]
+    k = np.flatnonzero(surest >= 0)
+    if len(k) == 0:
+        return np.zeros(3)
+    steps = np.tile(np.eye(4), (len(surest), 1, 1))
+    steps[k] = problem.motions.select(surest[k]).body_motion(problem.scale_log_mean)
+    T = se3.chain(steps, se3.transform(R_world_body_first, np.zeros(3)))
+    velocity: Array = np.median((np.diff(T[:, :3, 3], axis=0) / problem.dt_s[:len(surest), None])[k], axis=0)
+    return velocity
+
+
 def ekf_estimate(problem: Problem, R_world_body_first: Array, initial: InitialConfig) -> Estimate:
     """Filter a whole recording; only motions between neighbouring frames are used.
 
@@ -181,6 +199,7 @@ def ekf_estimate(problem: Problem, R_world_body_first: Array, initial: InitialCo
         raise EstimationError("ekf: no motion joins two neighbouring frames, and the filter uses no others; "
                               "give such motions or use the graph")
     ekf = _CapsuleEkf(problem, R_world_body_first, initial)
+    ekf.v = starting_velocity(problem, R_world_body_first)
     m = len(problem)
     T, cov, v = np.tile(np.eye(4), (m, 1, 1)), np.zeros((m, 6, 6)), np.zeros((m, 3))
     gyro_bias, accel_bias, outliers = np.zeros((m, 3)), np.zeros((m, 3)), []

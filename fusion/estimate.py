@@ -41,6 +41,8 @@ class Estimate:
     imu_inflation: float = 1.0
     joint: JointSamples | None = None
     """How the errors of all poses hang together; None where it could not be sampled."""
+    notes: tuple[str, ...] = ()
+    """Where less than the whole of the estimator was used, and why."""
 
 
 def add_scale_uncertainty(T_world_body: Array, cov: Array, log_scale_sd: float, T_body_camera: Array) -> Array:

@@ -7,16 +7,19 @@ The relative motions are not in here: they are linearised in numpy (`scaled_moti
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TypeAlias
 
 import gtsam
 import numpy as np
 from gtsam.symbol_shorthand import B, S, V, X
 from numpy.typing import NDArray
 
+from fusion.chain_state import ChainState
 from fusion.config import InitialConfig
 from fusion.problem import Problem
 
 Array = NDArray[np.float64]
+Values: TypeAlias = "gtsam.Values | ChainState"
 
 ANCHOR_SD_M, ANCHOR_SD_YAW_RAD = 1e-5, 1e-5
 """The first pose defines the world's origin and yaw; the sds only keep the system well conditioned."""
@@ -119,21 +122,27 @@ def insert_states(values: gtsam.Values, T_world_body: Array, v: Array, biases: l
         values.insert(B(first + k), biases[k])
 
 
-def read_poses(values: gtsam.Values) -> tuple[Array, Array]:
+def read_poses(values: Values) -> tuple[Array, Array]:
     """Rotations (M, 3, 3) and positions (M, 3) of all poses, in key order."""
+    if isinstance(values, ChainState):
+        return values.R, values.p
     flat = gtsam.utilities.extractPose3(values)
     return flat[:, :9].reshape(-1, 3, 3), flat[:, 9:]
 
 
-def read_states(values: gtsam.Values, first: int, count: int) -> States:
+def read_states(values: Values, first: int, count: int) -> States:
     """Read `count` nodes from `first` on out of a solution that holds exactly those poses."""
     R, p = read_poses(values)
+    if isinstance(values, ChainState):
+        return States(R, p, values.v, values.accel_bias, values.gyro_bias)
     nodes = range(first, first + count)
     v = np.array([values.atVector(V(k)) for k in nodes])
     bias = np.array([values.atConstantBias(B(k)).vector() for k in nodes])
     return States(R, p, v, bias[:, :3], bias[:, 3:])
 
 
-def read_log_scales(values: gtsam.Values, count: int) -> Array:
+def read_log_scales(values: Values, count: int) -> Array:
     """(count,) log scales of all segments."""
+    if isinstance(values, ChainState):
+        return values.log_scale
     return np.array([values.atDouble(S(k)) for k in range(count)])

@@ -3,30 +3,32 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Any
 
-import gtsam
 import numpy as np
-from gtsam.symbol_shorthand import S
 from numpy.typing import NDArray
 
 from fusion import scale as scale_policy
+from fusion.chain_engine import ChainEngine
+from fusion.checkpoint import Checkpoint, ResumableEngine
 from fusion.config import RefineConfig
-from fusion.covariance import marginal_covariances
+from fusion.engine import Begin, Engine, Uncertainty
 from fusion.estimate import Estimate, add_scale_uncertainty
-from fusion.graph import add_anchor, add_imu, add_scale_walk, read_log_scales, read_states
-from fusion.initialization import Start, chunked_start, search_log_scale
+from fusion.graph import read_log_scales, read_states
+from fusion.initialization import search_log_scale
 from fusion.joint import SEED, with_assumed_scale
-from fusion.joint_graph import sample_graph
+from fusion.native_engine import NativeEngine
 from fusion.problem import Problem
 from fusion.result import ScaleConclusion, ScalePolicy
 from fusion.scale import FreePass, Segments
-from fusion.solve import MotionTerm, Solution, gauss_newton, linear_graph
+from fusion.solve import MotionTerm, Solution
 from fusion.stages import Stages
+from fusion.stretches import contradicted, demoted
 from vio.errors import EstimationError
 
 Array = NDArray[np.float64]
 
-COARSE_TOLERANCE = 1e-3
+COARSE_TOLERANCE = 2e-2
 """Of the Huber passes: they only have to tell outliers from the rest, and Huber alone would bias the scale."""
 GATED_SHARE = 0.1
 """A rejected motion weighs this over its squared norm: the true step still lies within a few of its errors."""
@@ -37,10 +39,12 @@ GATE_ROUNDS = 3
 class _Pass:
     """A finished optimisation with its factors, ready for covariances."""
 
-    native: gtsam.NonlinearFactorGraph
+    model: Any
     term: MotionTerm
     solution: Solution
     imu_chi2: float
+    uncertainty: Uncertainty | None = None
+    """Where it was needed already."""
 
     @property
     def rejected(self) -> NDArray[np.int64]:
@@ -50,20 +54,34 @@ class _Pass:
 class GraphEstimator:
     """Solves one problem; holds what the passes share."""
 
-    def __init__(self, problem: Problem, config: RefineConfig, stages: Stages) -> None:
+    def __init__(self, problem: Problem, config: RefineConfig, stages: Stages,
+                 checkpoint: Checkpoint | None = None) -> None:
         self.problem, self.config, self.stages = problem, config, stages
+        self.engine: Engine = NativeEngine()
+        if ChainEngine.suits(problem):
+            self.engine = ChainEngine() if checkpoint is None else ResumableEngine(ChainEngine(), checkpoint)
+        self.notes: list[str] = []
         self.segments: Segments = scale_policy.make_segments(problem.t_s, config.scale.segment_s)
 
     def estimate(self) -> Estimate:
-        """Run the whole recipe.
+        """Run the whole recipe, on gtsam where the chain cannot be solved.
 
         Raises:
             EstimationError: a stage found no solution.
         """
         self._check_solvable()
+        try:
+            return self._estimate()
+        except EstimationError as error:
+            if isinstance(self.engine, NativeEngine):
+                raise
+            self.engine = NativeEngine()
+            return replace(self._estimate(), notes=(*self.notes, f"{error}; solved by gtsam"))
+
+    def _estimate(self) -> Estimate:
         start_scale = self._start_scale()
         with self.stages("initialization"):
-            start = self._start(start_scale, 1.0)
+            start = self._trusted_start(start_scale)
         with self.stages("fixed_scale"):
             fixed = self._fixed_pass(start, start_scale)
         final, conclusion, inflation = self._decide(fixed, start_scale)
@@ -80,25 +98,30 @@ class GraphEstimator:
         with self.stages("scale_search"):
             return search_log_scale(self.problem, self.config)
 
-    def _start(self, log_scale: float, inflation: float) -> Start:
-        return chunked_start(self.problem, self.config, log_scale, inflation)
+    def _trusted_start(self, log_scale: float) -> Begin:
+        """A start in whose stretches the IMU agrees with the rest, or is trusted less."""
+        start = self._start(log_scale, 1.0)
+        for without_imu in (False, True):
+            bad = contradicted(start.stretches)
+            if not bad:
+                break
+            self.problem, words = demoted(self.problem, bad, without_imu)
+            self.notes += words
+            start = self._start(log_scale, 1.0)
+        return start
 
-    def _native(self, start: Start) -> gtsam.NonlinearFactorGraph:
-        native = gtsam.NonlinearFactorGraph()
-        add_anchor(native, 0, start.anchor)
-        add_imu(native, start.measurements, self.problem)
-        return native
+    def _start(self, log_scale: float, inflation: float) -> Begin:
+        return self.engine.begin(self.problem, self.config, log_scale, inflation)
 
-    def _fixed_pass(self, start: Start, log_scale: float) -> _Pass:
-        native = self._native(start)
+    def _fixed_pass(self, start: Begin, log_scale: float) -> _Pass:
         motions = self.problem.motions
         term = MotionTerm(motions, None, log_scale, self.config.robust.huber, np.ones(len(motions)))
-        solution = gauss_newton(native, start.values, term, self.config.solver.max_iterations, COARSE_TOLERANCE)
-        return self._finished(native, term, solution)
+        solution = self.engine.solve(start, term, self.config.solver.max_iterations, COARSE_TOLERANCE)
+        return self._finished(start.model, term, solution)
 
-    def _finished(self, native: gtsam.NonlinearFactorGraph, term: MotionTerm, solution: Solution) -> _Pass:
+    def _finished(self, model: Any, term: MotionTerm, solution: Solution) -> _Pass:
         chi2 = scale_policy.imu_chi2(solution.native_cost, int(self.problem.imu_usable.sum()))
-        return _Pass(native, term, solution, chi2)
+        return _Pass(model, term, solution, chi2)
 
     def _decide(self, fixed: _Pass, start_scale: float) -> tuple[_Pass, ScaleConclusion, float]:
         """Try scale free; where it cannot be measured keep the prior's; where the IMU disagrees, trust it less."""
@@ -146,24 +169,27 @@ class GraphEstimator:
         return final, ScaleConclusion(policy, log_scale, self.problem.scale_log_sd, reason), inflation
 
     def _free_pass(self, fixed: _Pass, start_scale: float) -> tuple[_Pass, FreePass]:
-        scale, problem = self.config.scale, self.problem
-        native = gtsam.NonlinearFactorGraph(fixed.native)
-        add_scale_walk(native, self.segments.t_s, problem.scale_log_mean, problem.scale_log_sd, scale.walk_per_sqrt_s)
-        values = gtsam.Values(fixed.solution.values)
-        for k in range(len(self.segments.t_s)):
-            values.insert(S(k), start_scale)
-        term = replace(fixed.term, segment=self.segments.of_node[problem.motions.i])
+        count = len(self.segments.t_s)
+        begin = self.engine.free(Begin(fixed.model, fixed.solution.values), self.problem, self.segments,
+                                 self.config.scale.walk_per_sqrt_s, start_scale)
+        term = replace(fixed.term, segment=self.segments.of_node[self.problem.motions.i])
         with self.stages("free_scale"):
-            solution = gauss_newton(native, values, term, self.config.solver.max_iterations, COARSE_TOLERANCE)
+            solution = self.engine.solve(begin, term, self.config.solver.max_iterations, COARSE_TOLERANCE)
         with self.stages("gate"):
-            final = self._gated(self._finished(native, term, solution))
-        with self.stages("scale_uncertainty"):
-            gaussian = linear_graph(final.native, final.solution.values, final.term)
-            variance = marginal_covariances(gaussian, 0, len(self.segments.t_s))[1]
-        log_scale = read_log_scales(final.solution.values, len(self.segments.t_s))
-        share = len(final.rejected) / len(problem.motions)
+            final = self._gated(self._finished(begin.model, term, solution))
+        with self.stages("covariances"):
+            final = replace(final, uncertainty=self._uncertainty(final))
+        assert final.uncertainty is not None
+        log_scale = read_log_scales(final.solution.values, count)
+        share = len(final.rejected) / len(self.problem.motions)
         signal = final.term.signal(final.solution.values)
-        return final, FreePass(final.imu_chi2, log_scale, np.sqrt(variance), share, signal)
+        return final, FreePass(final.imu_chi2, log_scale, np.sqrt(final.uncertainty.log_scale_variance), share, signal)
+
+    def _uncertainty(self, final: _Pass) -> Uncertainty:
+        estimated = final.term.segment is not None
+        begin = Begin(final.model, final.solution.values)
+        return self.engine.uncertainty(begin, final.term, self.segments if estimated else None,
+                                       np.random.default_rng(SEED))
 
     def _gated(self, huber: _Pass) -> _Pass:
         """Reject what lies beyond the gate, solve as Gaussian, and look again until the gate is settled."""
@@ -175,28 +201,27 @@ class GraphEstimator:
                 break
             weight = np.where(accepted, 1.0, GATED_SHARE / np.maximum(squared, gate))
             term = replace(current.term, huber=None, weight=weight)
-            solution = gauss_newton(current.native, current.solution.values, term, solver.max_iterations,
-                                    solver.relative_tolerance)
-            current = self._finished(current.native, term, solution)
+            solution = self.engine.solve(Begin(current.model, current.solution.values), term, solver.max_iterations,
+                                         solver.relative_tolerance)
+            current = self._finished(current.model, term, solution)
         return current
 
     def _read(self, final: _Pass, conclusion: ScaleConclusion, fixed_chi2: float, inflation: float) -> Estimate:
         m, segments = len(self.problem), len(self.segments.t_s)
         estimated = final.term.segment is not None
-        gaussian = linear_graph(final.native, final.solution.values, final.term)
-        cov, variance = marginal_covariances(gaussian, m, segments if estimated else 0)
-        rng = np.random.default_rng(SEED)
-        joint = sample_graph(gaussian, m, self.segments.of_node if estimated else None, rng)
+        uncertainty = final.uncertainty or self._uncertainty(final)
+        cov, joint = uncertainty.cov, uncertainty.joint
         states = read_states(final.solution.values, 0, m)
         T = states.T_world_body
         if estimated:
             of_node = self.segments.of_node
             log_scale = read_log_scales(final.solution.values, segments)[of_node]
-            log_scale_sd = np.sqrt(variance)[of_node]
+            log_scale_sd = np.sqrt(uncertainty.log_scale_variance)[of_node]
         else:
             log_scale, log_scale_sd = np.full(m, conclusion.log_mean), np.full(m, conclusion.log_sd)
             T_body_camera = self.problem.motions.T_body_camera
             cov = add_scale_uncertainty(T, cov, conclusion.log_sd, T_body_camera)
-            joint = None if joint is None else with_assumed_scale(joint, T, conclusion.log_sd, T_body_camera, rng)
+            joint = None if joint is None else with_assumed_scale(
+                joint, T, conclusion.log_sd, T_body_camera, np.random.default_rng(SEED + 1))
         return Estimate(T, cov, states.v, states.gyro_bias, states.accel_bias, log_scale, log_scale_sd, conclusion,
-                        final.rejected, fixed_chi2, inflation, joint)
+                        final.rejected, fixed_chi2, inflation, joint, tuple(self.notes))

@@ -5,6 +5,7 @@ Chaining a whole examination lets the tilt drift until Gauss-Newton diverges; ch
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import gtsam
@@ -12,7 +13,7 @@ import numpy as np
 from gtsam.symbol_shorthand import B, V, X
 from numpy.typing import NDArray
 
-from fusion.config import RefineConfig
+from fusion.config import RefineConfig, SolverConfig
 from fusion.graph import Anchor, add_anchor, add_imu, first_anchor, insert_states
 from fusion.preintegration import preintegrate
 from fusion.problem import Problem
@@ -69,10 +70,12 @@ def level_rotation(problem: Problem, R_chain: Array, first: int) -> Array:
     return se3.so3_exp(axis / sine * np.arctan2(sine, cosine))
 
 
-def gyro_chain(problem: Problem, measurements: list[gtsam.PreintegratedCombinedMeasurements], first: int) -> Array:
-    """Attitudes (K+1, 3, 3) relative to node `first`; the measured motion's rotation where the IMU is missing."""
-    steps = np.array([m.deltaRij().matrix() for m in measurements])
-    T = se3.transform(steps, np.zeros(3))
+def gyro_chain(problem: Problem, R_steps: Array, first: int) -> Array:
+    """Attitudes (K+1, 3, 3) relative to node `first`, from the gyro's rotations (K, 3, 3) of the intervals after it.
+
+    The measured motion's rotation stands in where the IMU is missing.
+    """
+    T = se3.transform(R_steps, np.zeros(3))
     body = problem.motions.body_rotation()
     consecutive = np.flatnonzero(problem.motions.j - problem.motions.i == 1)
     for n in consecutive[~problem.imu_usable[problem.motions.i[consecutive]]]:
@@ -80,6 +83,18 @@ def gyro_chain(problem: Problem, measurements: list[gtsam.PreintegratedCombinedM
         if 0 <= k < len(T):
             T[k, :3, :3] = body[n]
     return se3.chain(T)[:, :3, :3]
+
+
+def chunk_spans(intervals: int, solver: SolverConfig) -> Iterator[tuple[int, int, int]]:
+    """First node, node to continue from, and last node of every chunk; the last two agree in the last chunk."""
+    k0 = 0
+    while k0 < intervals:
+        keep = min(k0 + solver.chunk_frames, intervals)
+        k1 = min(keep + solver.overlap_frames, intervals)
+        if intervals - keep < SHORTEST_TAIL:
+            keep = k1 = intervals
+        yield k0, keep, k1
+        k0 = keep
 
 
 def chunked_start(problem: Problem, config: RefineConfig, log_scale: float, accel_inflation: float = 1.0) -> Start:
@@ -91,15 +106,11 @@ def chunked_start(problem: Problem, config: RefineConfig, log_scale: float, acce
     Raises:
         EstimationError: a chunk cannot be solved.
     """
-    intervals, solver = len(problem) - 1, config.solver
+    intervals = len(problem) - 1
     values = gtsam.Values()
     measurements: list[gtsam.PreintegratedCombinedMeasurements] = []
-    anchor, first_of_all, k0 = None, None, 0
-    while k0 < intervals:
-        keep = min(k0 + solver.chunk_frames, intervals)
-        k1 = min(keep + solver.overlap_frames, intervals)
-        if intervals - keep < SHORTEST_TAIL:
-            keep = k1 = intervals
+    anchor, first_of_all = None, None
+    for k0, keep, k1 in chunk_spans(intervals, config.solver):
         bias = np.r_[np.zeros(3), problem.gyro_bias_rad_s] if anchor is None else anchor.bias.vector()
         chunk = _preintegrate(problem, bias, accel_inflation, (k0, k1))
         anchor, solution = _solve_chunk(problem, config, log_scale, chunk, (k0, k1), anchor)
@@ -109,7 +120,7 @@ def chunked_start(problem: Problem, config: RefineConfig, log_scale: float, acce
             values.insert(V(k), solution.values.atVector(V(k)))
             values.insert(B(k), solution.values.atConstantBias(B(k)))
         measurements += chunk[: keep - k0]
-        anchor, k0 = _carried(solution.values, keep), keep
+        anchor = _carried(solution.values, keep)
     if first_of_all is None:
         raise EstimationError("graph: no interval between frames")
     return Start(values, measurements, first_of_all)
@@ -132,13 +143,13 @@ def _solve_chunk(problem: Problem, config: RefineConfig, log_scale: float,
     k0, k1 = span
     inside = (problem.motions.i >= k0) & (problem.motions.j <= k1)
     motions = problem.motions.select(inside, first_node=k0)
-    R = gyro_chain(problem, measurements, k0)
+    R = gyro_chain(problem, np.array([m.deltaRij().matrix() for m in measurements]), k0)
     if anchor is None:
         R = level_rotation(problem, R, k0) @ R
         anchor = first_anchor(se3.transform(R[0], np.zeros(3)), problem.gyro_bias_rad_s, config.initial)
     else:
         R = anchor.T_world_body[:3, :3] @ R
-    p, v = _chain_positions(problem, motions, R, anchor.T_world_body[:3, 3], log_scale, k0)
+    p, v = chain_positions(problem, motions, R, anchor.T_world_body[:3, 3], log_scale, k0)
     guess = gtsam.Values()
     insert_states(guess, se3.transform(R, p), v, [anchor.bias] * len(R), k0)
     graph = gtsam.NonlinearFactorGraph()
@@ -148,7 +159,7 @@ def _solve_chunk(problem: Problem, config: RefineConfig, log_scale: float,
     return anchor, gauss_newton(graph, guess, term, CHUNK_ITERATIONS, CHUNK_TOLERANCE)
 
 
-def _chain_positions(problem: Problem, motions: ScaledMotions, R: Array, p0: Array, log_scale: float,
+def chain_positions(problem: Problem, motions: ScaledMotions, R: Array, p0: Array, log_scale: float,
                      k0: int) -> tuple[Array, Array]:
     """First guess of positions and velocities: measured steps, outliers shortened, along the gyro's attitudes."""
     step = np.zeros((len(R) - 1, 3))

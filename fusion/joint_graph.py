@@ -12,6 +12,7 @@ from typing import Any
 
 import gtsam
 import numpy as np
+from gtsam.symbol_shorthand import S, X
 from numpy.typing import NDArray
 from scipy.linalg import LinAlgError, cholesky_banded
 from scipy.linalg.lapack import dtbtrs
@@ -24,10 +25,11 @@ Indices = NDArray[np.int64]
 DIMENSION = 16
 OFFSETS = {"s": (0, 1), "x": (1, 7), "v": (7, 10), "b": (10, 16)}
 """Where the components of a node's log scale, pose, velocity and bias stand among its 16."""
+KINDS = {kind: end - begin for kind, (begin, end) in OFFSETS.items()}
 TIE_INFORMATION = 1e10
 """Ties the copies of one log scale to 1e-5, far closer than any is known."""
 LARGEST_BAND = 250_000_000
-"""Numbers in the band (2 GB); motions over very many frames would need more, and such a graph is not sampled."""
+"""Numbers in the band (2 GB); motions over very many frames would need more, and gtsam eliminates such a graph."""
 COLUMNS = 10
 
 
@@ -42,12 +44,12 @@ def sample_graph(gaussian: gtsam.GaussianFactorGraph, nodes: int, segment_of_nod
         rng: source of the draws.
 
     Returns:
-        None where the graph is too wide for a band or too stiff for Cholesky.
+        None where the graph is too stiff for Cholesky.
     """
     rows, blocks = _factors(gaussian, nodes, segment_of_node)
     width = max(int(np.ptp(index, axis=1).max()) for index in rows) + 1
     if width * nodes * DIMENSION > LARGEST_BAND:
-        return None
+        return _sample_tree(gaussian, nodes, segment_of_node, rng)
     band = _band(rows, blocks, nodes * DIMENSION, width)
     _tie_scales(band, nodes, segment_of_node)
     root = np.sqrt(band[0])
@@ -66,6 +68,29 @@ def sample_graph(gaussian: gtsam.GaussianFactorGraph, nodes: int, segment_of_nod
         draws[first:first + COLUMNS] = (solved[kept] / root[kept, None]).T
     values = draws.reshape(SAMPLES, len(node), 7)
     return JointSamples(node, values[..., 1:].copy(), values[..., 0].copy())
+
+
+def _sample_tree(gaussian: gtsam.GaussianFactorGraph, nodes: int, segment_of_node: Indices | None,
+                 rng: np.random.Generator) -> JointSamples | None:
+    """The same from gtsam's elimination in METIS order: for motions that join frames far apart. R x = z, z white."""
+    try:
+        net = gaussian.eliminateSequential(gtsam.Ordering.MetisGaussianFactorGraph(gaussian))
+    except RuntimeError:  # indeterminate under Cholesky: gtsam has no class of its own for it
+        return None
+    node = checkpoints(nodes)
+    keys = [(key, KINDS[chr(gtsam.Symbol(key).chr())]) for key in list(net.keyVector())]
+    poses = [X(k) for k in node.tolist()]
+    scales = None if segment_of_node is None else [S(k) for k in segment_of_node[node].tolist()]
+    xi, log_scale = np.empty((SAMPLES, len(node), 6)), np.zeros((SAMPLES, len(node)))
+    for n in range(SAMPLES):
+        white = gtsam.VectorValues()
+        for key, size in keys:
+            white.insert(key, rng.standard_normal(size))
+        drawn = net.backSubstitute(white)
+        xi[n] = [drawn.at(key) for key in poses]
+        if scales is not None:
+            log_scale[n] = [drawn.at(key)[0] for key in scales]
+    return JointSamples(node, xi, log_scale)
 
 
 def _factors(gaussian: gtsam.GaussianFactorGraph, nodes: int,

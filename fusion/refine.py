@@ -5,10 +5,12 @@ from __future__ import annotations
 import resource
 import sys
 from collections.abc import Callable
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
+from fusion.checkpoint import Checkpoint, refinement_key
 from fusion.config import RefineConfig
 from fusion.ekf import ekf_estimate
 from fusion.estimate import Estimate, motions_estimate
@@ -29,7 +31,7 @@ Array = NDArray[np.float64]
 
 
 def refine(recording: Recording, motions: RelativeMotions, config: RefineConfig | None = None,
-           announce: Callable[[str], None] | None = None) -> Refinement:
+           announce: Callable[[str], None] | None = None, resume: str | Path | None = None) -> Refinement:
     """Turn relative motions and inertial samples into one globally consistent trajectory.
 
     Args:
@@ -37,6 +39,8 @@ def refine(recording: Recording, motions: RelativeMotions, config: RefineConfig 
         motions: measured motions of the camera, from any source.
         config: every knob; defaults when None.
         announce: called with the name of every stage as it begins.
+        resume: folder that keeps finished stages of the graph. The same call after a kill reads them back and ends
+            with the same bytes; whoever asked for the folder removes it in the end (`checkpoint.unfinished`).
 
     Returns:
         The refined trajectory with covariances, beside the trajectory of the motions alone at the
@@ -50,16 +54,18 @@ def refine(recording: Recording, motions: RelativeMotions, config: RefineConfig 
     stages = Stages(announce)
     with stages("checks"):
         problem = build_problem(recording, motions)
-    estimate, estimator, reason = _first_that_works(problem, motions, config, stages)
-    return _conclude(recording, motions, problem, estimate, estimator, reason, stages)
+    checkpoint = None if resume is None else Checkpoint(resume, refinement_key(recording, motions, config))
+    estimate, estimator, reason = _first_that_works(problem, motions, config, stages, checkpoint)
+    return conclude(recording, motions, problem, estimate, estimator, reason, stages)
 
 
-def _first_that_works(problem: Problem, motions: RelativeMotions, config: RefineConfig,
-                      stages: Stages) -> tuple[Estimate, Estimator, str | None]:
+def _first_that_works(problem: Problem, motions: RelativeMotions, config: RefineConfig, stages: Stages,
+                      checkpoint: Checkpoint | None) -> tuple[Estimate, Estimator, str | None]:
     reasons: list[str] = []
     if config.estimator in ("auto", "graph"):
         try:
-            return _sane(GraphEstimator(problem, config, stages).estimate(), "graph"), "graph", None
+            estimate = _sane(GraphEstimator(problem, config, stages, checkpoint).estimate(), "graph")
+            return estimate, "graph", "; ".join(estimate.notes) or None
         except EstimationError as error:
             if config.estimator == "graph":
                 raise
@@ -95,8 +101,9 @@ def _sane(estimate: Estimate, name: str) -> Estimate:
     return estimate
 
 
-def _conclude(recording: Recording, motions: RelativeMotions, problem: Problem, estimate: Estimate,
-              estimator: Estimator, reason: str | None, stages: Stages) -> Refinement:
+def conclude(recording: Recording, motions: RelativeMotions, problem: Problem, estimate: Estimate,
+             estimator: Estimator, reason: str | None, stages: Stages) -> Refinement:
+    """A refinement from an estimate: beside the motions alone, with truth where there is any."""
     times = problem.t_s
     only, bridged = chain_motions(motions, times, problem.motions.T_body_camera, estimate.T_world_body[0])
     return Refinement(

@@ -62,6 +62,20 @@ class View:
 
 
 @dataclass(frozen=True)
+class OnlineConclusion:
+    """How a recording fared that was estimated frame by frame."""
+
+    lag_s: float
+    """How long a frame stayed open to correction."""
+    latency_ms: dict[str, float]
+    """`p50`, `p99` and `max` over the frames, from arrival to answer."""
+    resets: int
+    """How often the smoother had to begin anew."""
+    filtered: Trajectory
+    """M poses as they were known when their frame arrived."""
+
+
+@dataclass(frozen=True)
 class Refinement:
     """One refined recording of M frames."""
 
@@ -103,6 +117,8 @@ class Refinement:
     """How the frames looked at the world; None when unknown."""
     inertial: InertialLevels | None = None
     """What the IMU felt along time; None when unknown."""
+    online: OnlineConclusion | None = None
+    """Where the recording was estimated frame by frame; the trajectory then holds poses as they left the lag."""
 
 
 def check_same_recording(refinement: Refinement, recording: Recording) -> None:

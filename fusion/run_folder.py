@@ -70,6 +70,8 @@ def write_run(refinement: Refinement, out: str | Path, provenance: Provenance,
         write_tum(refinement.motions_only, folder / "motions_only.tum")
         if refinement.truth is not None:
             write_tum(refinement.truth, folder / "truth.tum")
+        if refinement.online is not None:
+            write_tum(refinement.online.filtered, folder / "filtered.tum")
         _write_states(refinement, folder / "trajectory.npz")
         _write_json(summary, folder / "summary.json")
         write_trajectory_plot(refinement, folder / "trajectory.svg", motions)

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusion.joint import JointSamples
-from fusion.result import ImuConclusion, Refinement, ScaleConclusion, View
+from fusion.result import ImuConclusion, OnlineConclusion, Refinement, ScaleConclusion, View
 from vio import se3
 from vio.camera import Camera
 from vio.errors import FormatError, VioError
@@ -82,6 +82,8 @@ def _refinement(folder: Path, summary: dict[str, Any], motions_only: Trajectory,
                 states: dict[str, Array], arrays: dict[str, Any], joint: JointSamples | None,
                 view: View | None, inertial: InertialLevels | None) -> Refinement:
     truth = folder / "truth.tum"
+    online = summary.get("online", {})
+    filtered = read_tum(folder / "filtered.tum") if online else None
     try:
         imu, scale, motions = summary["imu"], summary["scale"], summary["motions"]
         gaps = tuple(Gap(float(gap["start_s"]), float(gap["end_s"])) for gap in imu["gaps"])
@@ -96,6 +98,8 @@ def _refinement(folder: Path, summary: dict[str, Any], motions_only: Trajectory,
             time_offset_s=float(summary["time_offset_s"]), truth=read_tum(truth) if truth.is_file() else None,
             timing_s=dict(summary["timing_s"]), peak_rss_bytes=int(summary["peak_rss_bytes"]), joint=joint, view=view,
             inertial=inertial,
+            online=None if filtered is None else OnlineConclusion(
+                float(online["lag_s"]), dict(online["latency_ms"]), int(online["resets"]), filtered),
         )
     except KeyError as error:
         raise FormatError(f"{folder.name}: summary.json or trajectory.npz lacks {error}; {AGAIN}") from None

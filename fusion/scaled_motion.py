@@ -45,7 +45,7 @@ class ScaledMotions:
     def __len__(self) -> int:
         return len(self.i)
 
-    def select(self, index: NDArray[np.int64] | NDArray[np.bool_], first_node: int = 0) -> ScaledMotions:
+    def select(self, index: NDArray[np.int64] | NDArray[np.bool_] | slice, first_node: int = 0) -> ScaledMotions:
         """The motions at `index`, with nodes renumbered from `first_node`."""
         return ScaledMotions(self.i[index] - first_node, self.j[index] - first_node, self.R[index], self.t[index],
                              self.whiten[index], self.T_body_camera)

@@ -6,6 +6,15 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
+DONE_BEFORE = {"fixed_scale": 0.35, "free_scale": 0.5, "gate": 0.6, "covariances": 0.8}
+"""Share of the graph's time that has passed when a stage begins, as measured on 86,400 frames."""
+
+
+def remaining_s(stage: str, elapsed_s: float) -> float | None:
+    """About how long the graph still takes when a stage begins; None where that is not known."""
+    done = DONE_BEFORE.get(stage)
+    return None if done is None else elapsed_s * (1 - done) / done
+
 
 class Stages:
     """Times stages; a stage entered twice adds up.

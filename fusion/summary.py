@@ -35,8 +35,12 @@ def summarize(refinement: Refinement) -> dict[str, Any]:
         "timing_s": r.timing_s,
         "peak_rss_bytes": r.peak_rss_bytes,
     }
+    estimates = {"refined": r.trajectory, "motions": r.motions_only}
+    if r.online is not None:
+        summary["online"] = {"lag_s": r.online.lag_s, "latency_ms": r.online.latency_ms, "resets": r.online.resets}
+        estimates["filtered"] = r.online.filtered
     if r.truth is not None and len(r.truth) >= 2:
-        summary |= accuracy_of({"refined": r.trajectory, "motions": r.motions_only}, r.truth)
+        summary |= accuracy_of(estimates, r.truth)
     return summary
 
 
@@ -52,3 +56,23 @@ def _paper_metrics(estimate: Trajectory, truth: Trajectory) -> dict[str, Any]:
     matched, reference = associate(estimate, truth)
     steps = [se3.inverse(t.T_world_body[:-1]) @ t.T_world_body[1:] for t in (matched, reference)]
     return dict(paper_motion_metrics(steps[0], steps[1]))
+
+
+def sentences(summary: dict[str, Any]) -> str:
+    """A summary in a few lines for a terminal."""
+    from fusion.compare_text import verdict
+
+    scale, fallback = summary["scale"], summary["fallback_reason"]
+    lines = [
+        f"estimator: {summary['estimator']}" + (f" (fell back: {fallback})" if fallback else ""),
+        f"{summary['frames']} frames, {summary['duration_s']:.1f} s, path {summary['path_length_m']:.4f} m",
+        f"scale: {scale['policy']} – {scale['reason']}",
+        f"motions: {summary['motions']['used']} used, {summary['motions']['rejected']} rejected",
+    ]
+    if "online" in summary:
+        ms = summary["online"]["latency_ms"]
+        lines.append(f"online with {summary['online']['lag_s']:g} s lag: latency per frame {ms['p50']:.1f} ms in the "
+                     f"median, 99 % within {ms['p99']:.1f} ms, at most {ms['max']:.1f} ms")
+    if "accuracy" in summary:
+        lines.append(verdict(summary["accuracy"]["motions"], summary["accuracy"]["refined"]))
+    return "\n".join(lines)

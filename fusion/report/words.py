@@ -123,7 +123,8 @@ def sentences(
     """(heading, sentence) pairs on what was concluded and why."""
     out = [("Estimator", f"{_begun(ESTIMATORS[refinement.estimator])}.")]
     if refinement.fallback_reason:
-        out.append(("Fallback", f"The first choice was not used: {_ended(refinement.fallback_reason)}"))
+        much = "everywhere" if refinement.estimator == "graph" else "at all"
+        out.append(("Fallback", f"The first choice was not used {much}: {_ended(refinement.fallback_reason)}"))
     scale = refinement.scale
     out.append(("Scale", f"{_begun(POLICIES[scale.policy])}: one motion unit is "
                          f"{length(math.exp(scale.log_mean))} {spread(scale.log_sd)} (1 sd). "

@@ -142,16 +142,17 @@ def estimate_of(problem, R0) -> Estimate:
     return ekf_estimate(problem, R0, InitialConfig())
 
 
-def test_perfect_data_give_the_truth(examine, noiseless):
+@pytest.mark.parametrize("seed, limit_m", [(25, 1e-4), (21, 2e-4)], ids=["slow start", "at 38 mm/s"])
+def test_perfect_data_give_the_truth(examine, noiseless, seed, limit_m):
     perfect = {"scale_prior_sd": 0.0, "scale_walk_per_sqrt_1000_frames": 0.0, "rotation_sd_rad": 1e-5,
                "translation_rel": 0.0, "translation_abs_m": 1e-6, "reported_sd": 0.0, "outliers": 0.0}
-    # Measured 0.02 to 0.11 mm on seeds 22 to 28; 0.9 mm on 21, which starts at 38 mm/s: a filter starts from rest.
-    exact = examine("stomach", "none", 0, 30.0, 25, perfect, accel_bias_sd_m_s2=0.05, gyro_bias_sd_rad_s=0.005)
+    # Measured 0.02 to 0.08 mm on seeds 22 to 29, 0.15 mm on 21, which starts at 38 mm/s; 0.86 mm there from rest.
+    exact = examine("stomach", "none", 0, 30.0, seed, perfect, accel_bias_sd_m_s2=0.05, gyro_bias_sd_rad_s=0.005)
     problem = build_problem(exact.recording, exact.motions)
     truth = exact.recording.truth
     estimate = estimate_of(problem, truth.rotations[0])
     T = truth.T_world_body[0] @ se3.inverse(estimate.T_world_body[0]) @ estimate.T_world_body
-    assert ate(Trajectory(truth.t_s, T), truth, "none").rmse_m < 1e-4
+    assert ate(Trajectory(truth.t_s, T), truth, "none").rmse_m < limit_m
     state = exact.recording.truth_state
     np.testing.assert_allclose(estimate.gyro_bias_rad_s[-1], state.gyro_bias_rad_s[-1], atol=2e-4)
     np.testing.assert_allclose(estimate.accel_bias_m_s2[-1], state.accel_bias_m_s2[-1], atol=5e-3)

@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 from gtsam.symbol_shorthand import S, X
 
-from fusion import ekf, estimate, graph_estimator, joint, joint_graph, refine
+from fusion import chain, ekf, estimate, joint, joint_graph, native_engine, refine
+from fusion.chain_engine import ChainEngine
 from fusion.config import ScaleConfig
 from fusion.joint import JointSamples, checkpoints
 from fusion.joint_graph import sample_graph
@@ -21,8 +22,13 @@ TOLERANCE = 6 / np.sqrt(MANY)
 
 @pytest.fixture
 def many(monkeypatch) -> None:
-    for module in (ekf, joint, joint_graph):
+    for module in (chain, ekf, joint, joint_graph):
         monkeypatch.setattr(module, "SAMPLES", MANY)
+
+
+@pytest.fixture
+def on_gtsam(monkeypatch) -> None:
+    monkeypatch.setattr(ChainEngine, "suits", lambda problem: False)
 
 
 def check_covariance(draws: np.ndarray, cov: np.ndarray) -> None:
@@ -33,14 +39,14 @@ def check_covariance(draws: np.ndarray, cov: np.ndarray) -> None:
 
 
 @pytest.mark.parametrize("policy", ["free", "fixed"])
-def test_graph_samples_have_the_joint_covariance_that_gtsam_finds(short, configured, many, monkeypatch, policy):
+def test_graph_samples_have_gtsams_joint_covariance(short, configured, many, on_gtsam, monkeypatch, policy):
     caught = {}
 
     def catch(gaussian, nodes, segments, rng):
         caught.update(gaussian=gaussian, nodes=nodes, segments=segments)
         return sample_graph(gaussian, nodes, segments, rng)
 
-    monkeypatch.setattr(graph_estimator, "sample_graph", catch)
+    monkeypatch.setattr(native_engine, "sample_graph", catch)
     scale = ScaleConfig(policy=policy, segment_s=5.0)
     refine(short.recording, short.motions, configured(estimator="graph", scale=scale))
     drawn = sample_graph(caught["gaussian"], caught["nodes"], caught["segments"], np.random.default_rng(3))
@@ -55,11 +61,13 @@ def test_graph_samples_have_the_joint_covariance_that_gtsam_finds(short, configu
         check_covariance(np.column_stack([drawn.log_scale[:, [2, 30]], drawn.xi[:, 30]]), cov)
 
 
-def test_wide_motions_are_sampled_too(short, configured, many):
+@pytest.mark.parametrize("chain_suits", [True, False])
+def test_wide_motions_are_sampled_too(short, configured, many, monkeypatch, chain_suits):
     """Every other frame joined as well: the band is wider, the covariances still gtsam's own."""
     m = short.motions
     wide = replace(m, t_i_s=np.r_[m.t_i_s, m.t_i_s[:-1]], t_j_s=np.r_[m.t_j_s, m.t_j_s[1:]],
                    T_i_j=np.r_[m.T_i_j, m.T_i_j[:-1] @ m.T_i_j[1:]], cov=np.r_[m.cov, 4 * m.cov[:-1]], snr=None)
+    monkeypatch.setattr(ChainEngine, "suits", lambda problem: chain_suits)
     refined = refine(short.recording, wide, configured(estimator="graph"))
     for k in (5, 20, 35):
         check_covariance(refined.joint.xi[:, k], refined.trajectory.cov[k])
@@ -79,9 +87,13 @@ def test_chained_motions_have_samples_too(short, many):
         check_covariance(found.joint.xi[:, k], found.cov[k])
 
 
-def test_a_graph_too_wide_for_a_band_has_none(short, configured, monkeypatch):
+@pytest.mark.parametrize("policy", ["free", "fixed"])
+def test_a_graph_too_wide_for_a_band_is_sampled_by_gtsam(short, configured, many, on_gtsam, monkeypatch, policy):
     monkeypatch.setattr(joint_graph, "LARGEST_BAND", 100)
-    assert refine(short.recording, short.motions, configured(estimator="graph")).joint is None
+    refined = refine(short.recording, short.motions, configured(estimator="graph", scale=ScaleConfig(policy=policy)))
+    for k in (5, 20, 35):
+        check_covariance(refined.joint.xi[:, k], refined.trajectory.cov[k])
+    assert refined.joint.log_scale[:, 9].std() == pytest.approx(refined.log_scale_sd[9], rel=0.05)
 
 
 def test_between_checkpoints_errors_are_interpolated(monkeypatch):

@@ -1,0 +1,228 @@
+"""The linear system of a recording as a chain: block-tridiagonal in the order of time, stored as a band.
+
+Every factor of a recording joins frames that are close in time. With the 16 unknowns of a frame side by side (log
+scale, pose, velocity, biases) the information matrix is a narrow band, which LAPACK factors in one pass; nothing has to
+be ordered, and no tree is built. Frames that wide motions join are put together into one block. Log scales belong to
+segments of many frames: each frame holds a copy, tied to its neighbours'.
+
+With H = L Lᵀ and white z, L⁻ᵀ z has covariance H⁻¹; backwards through the blocks
+
+    x_k = C_k^½ z_k - G_kᵀ x_{k+1},   C_k = (L_kk L_kkᵀ)⁻¹,   G_k = L_{k+1,k} L_kk⁻¹
+
+which gives the marginals, and joint samples at any blocks, in steps that add and never subtract.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import TypeAlias
+
+import numpy as np
+from numpy.lib.stride_tricks import as_strided
+from numpy.typing import NDArray
+from scipy.linalg.lapack import dpbtrf, dpbtrs
+
+from fusion.joint import SAMPLES, JointSamples, checkpoints, square_root
+from vio.errors import EstimationError
+
+Array = NDArray[np.float64]
+Indices = NDArray[np.int64]
+Nodes: TypeAlias = "Indices | slice"
+
+DIM = 16
+SCALE, POSE, VELOCITY, BIAS, SCALE_AND_POSE = (slice(*ends) for ends in ((0, 1), (1, 7), (7, 10), (10, 16), (0, 7)))
+"""Where a frame's unknowns stand: log scale; rotation and translation in body axes; velocity; accelerometer, gyro."""
+BLOCK_NODES = 1500
+"""Frames handled at a time: what stays in a processor's cache is several times faster."""
+
+
+class ChainSystem:
+    """Normal equations `H x = g` of M frames, of which factors join at most `reach` apart.
+
+    The band's column c holds H[c : c + width, c]. A block of `reach` frames and the next one are a window; seen
+    through strides, entry (block, column, row) of that window lies at its place in the band. Only rows at or below
+    their column exist: what is added to a frame's own block goes in without its upper triangle. No factor joins a
+    frame with the biases of a later one, apart from the links of neighbours, which keeps the band as narrow as it is.
+    """
+
+    def __init__(self, nodes: int, reach: int) -> None:
+        self.nodes, self.reach = nodes, max(reach, 1)
+        self.blocks = -(-nodes // self.reach)
+        self.side = DIM * self.reach
+        width = self.side + BIAS.start
+        self.band = np.zeros((self.blocks * self.side, width))
+        size = self.band.itemsize
+        self._window = as_strided(self.band, (self.blocks, self.reach, DIM, 2 * self.reach, DIM),
+                                  tuple(size * s for s in (self.side * width, DIM * (width - 1), width - 1, DIM, 1)))
+        self.gradient = np.zeros((self.blocks * self.reach, DIM))
+        self._fill_up()
+
+    def clear(self) -> None:
+        """Forget all factors; the memory stays."""
+        self.band.fill(0.0)
+        self.gradient.fill(0.0)
+        self._fill_up()
+
+    def _fill_up(self) -> None:
+        self.band[self.nodes * DIM:, 0] = 1.0  # frames that only fill the last block
+
+    def add(self, i: Nodes, j: Nodes, first: tuple[slice, Array], second: tuple[slice, Array], b: Array) -> None:
+        """Add factors |A_i x_i + A_j x_j - b|² between frames with 0 < j - i ≤ reach, each unique in `i` and in `j`.
+
+        Args:
+            i: (N,) first frames, or a slice of them (then `j` is the slice one further, and frames make no blocks).
+            j: (N,) second frames.
+            first: which unknowns of the first frames, and A_i (N, r, n).
+            second: which unknowns of the second frames, none of them a bias, and A_j (N, r, m).
+            b: (N, r)
+        """
+        (rows_i, A_i), (rows_j, A_j) = first, second
+        A_i_t, A_j_t = np.swapaxes(A_i, 1, 2), np.swapaxes(A_j, 1, 2)
+        self._add_diagonal(i, rows_i, A_i_t @ A_i)
+        self._add_diagonal(j, rows_j, A_j_t @ A_j)
+        if isinstance(i, slice) or isinstance(j, slice):
+            self._window[i, 0, rows_i, 1, rows_j] += A_i_t @ A_j
+        else:
+            block, place = i // self.reach, i % self.reach
+            self._window[block, place, rows_i, j - block * self.reach, rows_j] += A_i_t @ A_j
+        self.gradient[i, rows_i] += (A_i_t @ b[:, :, None])[:, :, 0]
+        self.gradient[j, rows_j] += (A_j_t @ b[:, :, None])[:, :, 0]
+
+    def add_prior(self, node: int, information: Array, gradient: Array) -> None:
+        """Add information (16, 16) and gradient (16,) to one frame."""
+        self._add_diagonal(np.array([node]), slice(0, DIM), information[None])
+        self.gradient[node] += gradient
+
+    def add_everywhere(self, component: int, information: float) -> None:
+        """Add information to one unknown of all frames."""
+        self.band[component:self.nodes * DIM:DIM, 0] += information
+
+    def _add_diagonal(self, node: Nodes, rows: slice, information: Array) -> None:
+        lower = information * np.tri(information.shape[1]).T  # (column, row)
+        if isinstance(node, slice):
+            self._window[node, 0, rows, 0, rows] += lower
+        else:
+            block, place = node // self.reach, node % self.reach
+            self._window[block, place, rows, place, rows] += lower
+
+    def add_links(self, variable: slice, information: Array, difference: Array) -> None:
+        """Tie a variable of all neighbours: information (M-1, d) per component, wanted (M-1, d) change of x_j - x_i."""
+        column = self.band.reshape(self.blocks * self.reach, DIM, -1)
+        k = self.nodes - 1
+        for n, c in enumerate(range(DIM)[variable]):
+            q, d = information[:, n], information[:, n] * difference[:, n]
+            column[:k, c, 0] += q
+            column[1:k + 1, c, 0] += q
+            column[:k, c, DIM] -= q
+            self.gradient[:k, c] -= d
+            self.gradient[1:k + 1, c] += d
+
+    def factor(self) -> ChainFactor:
+        """Cholesky factor; the system's own memory is used for it.
+
+        Raises:
+            EstimationError: the matrix is not positive definite.
+        """
+        band, info = dpbtrf(self.band.T, lower=1, overwrite_ab=1)
+        if info != 0:
+            raise EstimationError(f"graph: the linear system is indeterminate (frame {(info - 1) // DIM})")
+        return ChainFactor(self, band.T)
+
+
+@dataclass(frozen=True)
+class ChainFactor:
+    """A factored chain."""
+
+    system: ChainSystem
+    band: Array
+    """(blocks · side, width) lower band of L, by columns."""
+
+    def solve(self) -> Array:
+        """The (M, 16) solution of the normal equations."""
+        x, info = dpbtrs(self.band.T, self.system.gradient.reshape(-1, 1), lower=1)
+        if info != 0 or not np.isfinite(x).all():
+            raise EstimationError("graph: the linear system has no finite solution")
+        return np.asarray(x).reshape(-1, DIM)[:self.system.nodes]
+
+    def backward(self) -> tuple[Array, Array]:
+        """C^½ (K, side, side), upper triangular, and -Gᵀ (K, side, side) of all blocks."""
+        side, K = self.system.side, self.system.blocks
+        flat = self.band.reshape(-1)
+        size, width = flat.itemsize, self.band.shape[1]
+        columns = as_strided(flat, (K, side, side), (size * side * width, size * (width - 1), size))
+        below = as_strided(flat[side:], (K - 1, side, side), (size * side * width, size * (width - 1), size))
+        mask, reached = np.tri(side).T, np.tri(side, side, width - 1 - side)  # by column, then row
+        root, carry = np.empty((K, side, side)), np.zeros((K, side, side))
+        for first, last in spans(K, max(1, BLOCK_NODES // self.system.reach)):
+            inverse_t = np.linalg.inv(columns[first:last] * mask)  # the transpose of L_kk⁻¹
+            root[first:last] = inverse_t
+            stop = min(last, K - 1)
+            carry[first:stop] = -inverse_t[:stop - first] @ (below[first:stop] * reached)
+        return root, carry
+
+    def marginals_and_samples(self, rng: np.random.Generator) -> tuple[Array, JointSamples]:
+        """Marginal covariances (M, 16, 16) of all frames, and joint samples of poses and log scales."""
+        root, carry = self.backward()
+        reach, side, K = self.system.reach, self.system.side, self.system.blocks
+        node = checkpoints(self.system.nodes)
+        stop = np.unique(node // reach)
+        if stop[-1] != K - 1:
+            raise EstimationError("graph: the last frame is not in the last block")
+        A, Q = _between(root, carry, stop)
+        cov = np.empty((K, side, side))
+        last = root[-1] @ root[-1].T
+        drawn = np.empty((len(stop), side, SAMPLES))
+        drawn[-1] = root[-1] @ rng.standard_normal((side, SAMPLES))
+        cov[K - 1] = last
+        noise = square_root(Q)
+        for k in range(len(stop) - 2, -1, -1):
+            cov[stop[k]] = A[k] @ cov[stop[k + 1]] @ A[k].T + Q[k]
+            drawn[k] = A[k] @ drawn[k + 1] + noise[k] @ rng.standard_normal((side, SAMPLES))
+        _fill(cov, root, carry, stop)
+        at = np.searchsorted(stop, node // reach)
+        values = drawn.reshape(len(stop), reach, DIM, SAMPLES)[at, node % reach]
+        samples = JointSamples(node, np.ascontiguousarray(np.moveaxis(values[:, POSE], 2, 0)),
+                               np.ascontiguousarray(values[:, 0].T))
+        return self._own(cov), samples
+
+    def _own(self, cov: Array) -> Array:
+        """The frames' own blocks (M, 16, 16) of block covariances."""
+        reach = self.system.reach
+        split = cov.reshape(self.system.blocks, reach, DIM, reach, DIM)
+        own = np.stack([split[:, a, :, a, :] for a in range(reach)], axis=1).reshape(-1, DIM, DIM)
+        return own[:self.system.nodes]
+
+
+def spans(count: int, size: int) -> Iterator[tuple[int, int]]:
+    """Consecutive (first, last) of at most `size`."""
+    for first in range(0, count, size):
+        yield first, min(first + size, count)
+
+
+def _between(root: Array, carry: Array, stop: Indices) -> tuple[Array, Array]:
+    """x at stop k = A x at stop k+1 + noise of covariance Q: (S-1, n, n) each, over all gaps at once."""
+    side = root.shape[1]
+    A = np.tile(np.eye(side), (len(stop) - 1, 1, 1))
+    Q = np.zeros_like(A)
+    for active, block in _steps(stop):
+        G, C = carry[block], root[block]
+        A[active] = G @ A[active]
+        Q[active] = G @ Q[active] @ np.swapaxes(G, 1, 2) + C @ np.swapaxes(C, 1, 2)
+    return A, Q
+
+
+def _fill(cov: Array, root: Array, carry: Array, stop: Indices) -> None:
+    """Marginals between the stops, from those at the stops."""
+    for _, block in _steps(stop):
+        inner = block[~np.isin(block, stop)]
+        G, C = carry[inner], root[inner]
+        cov[inner] = G @ cov[inner + 1] @ np.swapaxes(G, 1, 2) + C @ np.swapaxes(C, 1, 2)
+
+
+def _steps(stop: Indices) -> Iterator[tuple[Indices, Indices]]:
+    """Backwards from every stop to the one before: which gaps are still on their way, and the block each is at."""
+    length = np.diff(stop)
+    for t in range(int(length.max(initial=0))):
+        active = np.flatnonzero(length > t)
+        yield active, stop[1:][active] - 1 - t

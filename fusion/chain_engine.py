@@ -1,0 +1,58 @@
+"""The engine of recordings whose motions join frames close in time: one band in the order of time."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from fusion.chain import POSE
+from fusion.chain_model import ChainModel, ScaleWalk
+from fusion.chain_solve import chain_gauss_newton
+from fusion.chain_start import chain_start, inertial_steps
+from fusion.config import RefineConfig
+from fusion.engine import Begin, Uncertainty
+from fusion.problem import Problem
+from fusion.scale import Segments
+from fusion.solve import MotionTerm, Solution
+
+LONGEST_REACH = 4
+"""Frames that a motion may span; the work per frame grows with its square."""
+
+
+class ChainEngine:
+    """Solves a recording as a chain of frames."""
+
+    @staticmethod
+    def suits(problem: Problem) -> bool:
+        """Whether no motion joins frames that are far apart."""
+        return int((problem.motions.j - problem.motions.i).max()) <= LONGEST_REACH
+
+    def begin(self, problem: Problem, config: RefineConfig, log_scale: float, accel_inflation: float) -> Begin:
+        """Factors and first values at one log scale."""
+        steps = inertial_steps(problem, accel_inflation)
+        state, anchor, stretches = chain_start(problem, config, log_scale, steps)
+        return Begin(ChainModel(steps, anchor), state, tuple(stretches))
+
+    def free(self, begin: Begin, problem: Problem, segments: Segments, walk_per_sqrt_s: float,
+             log_scale: float) -> Begin:
+        """The same with log scales as unknowns."""
+        walk = ScaleWalk(segments.of_node, problem.scale_log_mean, problem.scale_log_sd,
+                         walk_per_sqrt_s * np.sqrt(np.diff(segments.t_s)))
+        return Begin(replace(begin.model, scale=walk),
+                     replace(begin.values, log_scale=np.full(len(segments.t_s), log_scale)))
+
+    def solve(self, begin: Begin, term: MotionTerm, max_iterations: int, relative_tolerance: float) -> Solution:
+        """Gauss-Newton."""
+        return chain_gauss_newton(begin.model, begin.values, term, max_iterations, relative_tolerance)
+
+    def uncertainty(self, begin: Begin, term: MotionTerm, segments: Segments | None,
+                    rng: np.random.Generator) -> Uncertainty:
+        """Covariances and joint samples from one factorisation."""
+        factor = begin.model.linearize(begin.values, term).factor()
+        cov, joint = factor.marginals_and_samples(rng)
+        variance = np.zeros(0)
+        if segments is not None:
+            begins = np.flatnonzero(np.diff(segments.of_node, prepend=-1))
+            variance = cov[begins, 0, 0]
+        return Uncertainty(np.ascontiguousarray(cov[:, POSE, POSE]), variance, joint)

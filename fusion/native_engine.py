@@ -1,0 +1,51 @@
+"""The engine of any graph: gtsam's factors, METIS ordering, multifrontal Cholesky, QR where Cholesky fails."""
+
+from __future__ import annotations
+
+import gtsam
+import numpy as np
+from gtsam.symbol_shorthand import S
+
+from fusion.config import RefineConfig
+from fusion.covariance import marginal_covariances
+from fusion.engine import Begin, Uncertainty
+from fusion.graph import add_anchor, add_imu, add_scale_walk
+from fusion.initialization import chunked_start
+from fusion.joint_graph import sample_graph
+from fusion.problem import Problem
+from fusion.scale import Segments
+from fusion.solve import MotionTerm, Solution, gauss_newton, linear_graph
+
+
+class NativeEngine:
+    """Solves a recording with gtsam."""
+
+    def begin(self, problem: Problem, config: RefineConfig, log_scale: float, accel_inflation: float) -> Begin:
+        """Factors and first values at one log scale."""
+        start = chunked_start(problem, config, log_scale, accel_inflation)
+        native = gtsam.NonlinearFactorGraph()
+        add_anchor(native, 0, start.anchor)
+        add_imu(native, start.measurements, problem)
+        return Begin(native, start.values)
+
+    def free(self, begin: Begin, problem: Problem, segments: Segments, walk_per_sqrt_s: float,
+             log_scale: float) -> Begin:
+        """The same with log scales as unknowns."""
+        native, values = gtsam.NonlinearFactorGraph(begin.model), gtsam.Values(begin.values)
+        add_scale_walk(native, segments.t_s, problem.scale_log_mean, problem.scale_log_sd, walk_per_sqrt_s)
+        for k in range(len(segments.t_s)):
+            values.insert(S(k), log_scale)
+        return Begin(native, values)
+
+    def solve(self, begin: Begin, term: MotionTerm, max_iterations: int, relative_tolerance: float) -> Solution:
+        """Gauss-Newton."""
+        return gauss_newton(begin.model, begin.values, term, max_iterations, relative_tolerance)
+
+    def uncertainty(self, begin: Begin, term: MotionTerm, segments: Segments | None,
+                    rng: np.random.Generator) -> Uncertainty:
+        """Covariances from a Bayes tree, joint samples from a band where the graph has one."""
+        nodes = int(term.motions.j.max()) + 1
+        gaussian = linear_graph(begin.model, begin.values, term)
+        cov, variance = marginal_covariances(gaussian, nodes, 0 if segments is None else len(segments.t_s))
+        joint = sample_graph(gaussian, nodes, None if segments is None else segments.of_node, rng)
+        return Uncertainty(cov, variance, joint)
