@@ -10,6 +10,7 @@ from gtsam.symbol_shorthand import S
 from numpy.typing import NDArray
 
 from fusion import scale as scale_policy
+from fusion.body_motion import BodyMotion, without_body_motion
 from fusion.config import RefineConfig
 from fusion.covariance import marginal_covariances
 from fusion.estimate import Estimate, add_scale_uncertainty
@@ -122,11 +123,15 @@ class GraphEstimator:
         return self._down_weighted(start_scale, objection)
 
     def _down_weighted(self, start_scale: float, why: str) -> tuple[_Pass, ScaleConclusion, float]:
-        """Raise the accelerometer's noise until it agrees, with scale near its prior; in the end hold the scale."""
-        for inflation in scale_policy.INFLATION_LADDER:
+        """Take periodic motion of the body out of the accelerometer, then raise its noise until it agrees."""
+        with self.stages("accelerometer_down_weighted"):
+            loose = self._fixed_pass(self._start(start_scale, scale_policy.LOOSE), start_scale)
+            self.problem, motion = self._without_body_motion(loose)
+        if motion.hz > 0:
+            why = f"{why}; a sway of the body of {1e3 * motion.amplitude_m:.2g} mm at {motion.hz:.2g} Hz was taken out"
+        for inflation in scale_policy.inflations(motion, self.problem.noise):
             with self.stages("accelerometer_down_weighted"):
-                start = self._start(start_scale, inflation)
-                fixed = self._fixed_pass(start, start_scale)
+                fixed = self._fixed_pass(self._start(start_scale, inflation), start_scale)
             if fixed.imu_chi2 > scale_policy.CALM_CHI2:
                 continue
             final, free = self._free_pass(fixed, start_scale)
@@ -139,11 +144,18 @@ class GraphEstimator:
         reason = f"held at the prior, the accelerometer serves for the direction of gravity only: {why}"
         return self._held(fixed, "fixed", start_scale, reason, scale_policy.GRAVITY_ONLY)
 
+    def _without_body_motion(self, loose: _Pass) -> tuple[Problem, BodyMotion]:
+        states, motions = read_states(loose.solution.values, 0, len(self.problem)), self.problem.motions
+        trusted = np.zeros(len(self.problem) - 1, bool)
+        trusted[motions.i[loose.solution.squared_norm < self.config.robust.gate]] = True
+        return without_body_motion(self.problem, states.R, states.p, states.accel_bias, states.gyro_bias, trusted)
+
     def _held(self, fixed: _Pass, policy: ScalePolicy, log_scale: float, reason: str,
               inflation: float) -> tuple[_Pass, ScaleConclusion, float]:
         with self.stages("gate"):
             final = self._gated(fixed)
-        return final, ScaleConclusion(policy, log_scale, self.problem.scale_log_sd, reason), inflation
+        sd = scale_policy.assumed_sd(self.problem, self.config.scale)
+        return final, ScaleConclusion(policy, log_scale, sd, reason), inflation
 
     def _free_pass(self, fixed: _Pass, start_scale: float) -> tuple[_Pass, FreePass]:
         scale, problem = self.config.scale, self.problem

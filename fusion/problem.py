@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from fusion.scaled_motion import ScaledMotions, make_motions
 from fusion.vibration import vibration_inflation
 from vio import se3
-from vio.imu import Gap, ImuNoise, ImuPieces, find_gaps, preintegrate_rotation, split_at_frames
+from vio.imu import Gap, ImuNoise, ImuPieces, ImuSamples, find_gaps, preintegrate_rotation, split_at_frames
 from vio.imu_checks import check_imu, saturated_samples
 from vio.motions import RelativeMotions, match_frames
 from vio.recording import Recording, check_refinable
@@ -49,6 +49,10 @@ class Problem:
     noise: ImuNoise
     gyro_bias_rad_s: Array
     """(3,) robust initial value: median disagreement of measured and gyro rotation."""
+    samples: ImuSamples
+    """What `pieces` were cut from, whole recording."""
+    imu_t_s: Array
+    """(S,) their stamps on the frames' clock."""
 
     @property
     def dt_s(self) -> Array:
@@ -85,8 +89,17 @@ def build_problem(recording: Recording, motions: RelativeMotions) -> Problem:
         accel_inflation=holes * clipped[1] * accel_inflation, gyro_inflation=holes * clipped[0] * gyro_inflation,
         motions=batch,
         scale_log_mean=motions.scale_log_mean, scale_log_sd=motions.scale_log_sd, noise=noise,
-        gyro_bias_rad_s=gyro_bias,
+        gyro_bias_rad_s=gyro_bias, samples=recording.imu, imu_t_s=imu_t,
     )
+
+
+def with_accelerometer(problem: Problem, accel_m_s2: Array) -> Problem:
+    """The problem with other specific forces (S, 3): cut anew, and the vibration in them judged anew."""
+    samples = replace(problem.samples, accel_m_s2=accel_m_s2)
+    before, after = (vibration_inflation(imu, problem.imu_t_s, problem.t_s, problem.noise)[0]
+                     for imu in (problem.samples, samples))
+    return replace(problem, samples=samples, accel_inflation=problem.accel_inflation / before * after,
+                   pieces=split_at_frames(samples, problem.imu_t_s, problem.t_s, problem.gyro_bias_rad_s))
 
 
 def _usable(t: Array, gaps: tuple[Gap, ...]) -> NDArray[np.bool_]:

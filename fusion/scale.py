@@ -7,9 +7,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from fusion.body_motion import BodyMotion
 from fusion.config import ScaleConfig
 from fusion.problem import Problem
 from fusion.result import ScaleConclusion
+from vio.imu import ImuNoise
 
 Array = NDArray[np.float64]
 
@@ -25,8 +27,13 @@ LEAST_SIGNAL = 1.5
 """Steps over noise below which noise alone would pass for a larger scale: nothing is measured then."""
 CALM_CHI2 = 0.75
 """Inertial chi² that a down-weighted accelerometer must reach: a little above the clean value."""
-INFLATION_LADDER = (3.0, 10.0)
+INFLATION_LADDER = (1.0, 3.0, 10.0, 30.0)
 """Factors on the accelerometer density that are tried when the IMU disagrees with the motions."""
+QUIET_EXCESS = 3.0
+"""Density of the acceleration that the camera does not see, over the accelerometer's: the camera's own noise reaches
+2.5 in it (measured, 1000 frames)."""
+LOOSE = 30.0
+"""Factor with which the accelerometer shows its bias and no longer bends the track that the motions describe."""
 GRAVITY_ONLY = 2500.0
 """Factor that leaves the accelerometer nothing but the mean direction of gravity."""
 
@@ -86,6 +93,29 @@ def reasons_against(free: FreePass, problem: Problem, config: ScaleConfig) -> st
         return (f"freeing the scale rejected {100 * free.rejected_share:.0f} % of the motions "
                 f"(limit {100 * PLAUSIBLE_REJECTED:.0f} %)")
     return None
+
+
+def inflations(motion: BodyMotion, noise: ImuNoise) -> list[float]:
+    """Factors on the accelerometer density to try, smallest first: none that the unseen acceleration exceeds.
+
+    The inertial chi² judges single frame intervals; a slow sway is hardly visible in one and bends the track all
+    the same, so its density at the sway's own frequency decides where to begin.
+    """
+    excess = motion.left_density_m_s2_rthz / noise.accel_density_m_s2_rthz
+    if excess > QUIET_EXCESS:
+        return [factor for factor in INFLATION_LADDER if factor >= excess]
+    return [factor for factor in INFLATION_LADDER if factor > 1 or motion.hz > 0]
+
+
+def assumed_sd(problem: Problem, config: ScaleConfig) -> float:
+    """Sd of the recording's mean log scale where it is not measured: the prior's, and the walk away from it.
+
+    A random walk from 0 has mean square walk² T / 3 in its average over T.
+    """
+    if problem.scale_log_sd == 0:
+        return 0.0
+    walked = config.walk_per_sqrt_s**2 * float(problem.t_s[-1] - problem.t_s[0]) / 3
+    return float(np.sqrt(problem.scale_log_sd**2 + walked))
 
 
 def hardly_moved(free: FreePass) -> str:

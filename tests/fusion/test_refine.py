@@ -313,28 +313,3 @@ def test_a_vague_prior_is_searched(examination, off, sd):
     assert refined.scale.policy == "free"
     assert abs(refined.scale.log_mean - examination.network.true_log_scale.mean()) < 0.1
     assert gain(refined) < 0.3
-
-
-# ---- a body that moves in ways the camera does not see ---------------------------------------
-
-@pytest.fixture(scope="module")
-def living(examine):
-    return examine("small-bowel", "gaussian", 2, 100.0, 202)
-
-
-@pytest.mark.parametrize(("amplitude_m", "frequency_hz"), [(0.005, 0.25), (0.001, 1.0)], ids=["breathing", "shifting"])
-def test_breathing_takes_the_scale_from_the_imu(living, amplitude_m, frequency_hz):
-    refined = refine(living.shaken_unseen(amplitude_m, frequency_hz), living.motions)
-    assert refined.estimator == "graph"
-    assert refined.scale.policy in ("prior", "fixed") and refined.imu.inflation > 1
-    assert "accelerometer noise ×" in refined.scale.reason
-    assert gain(refined) < 0.95
-
-
-def test_walking_leaves_only_the_direction_of_gravity(living):
-    """20 mm at 1.7 Hz: more than 2 m/s² that no motion confirms."""
-    refined = refine(living.shaken_unseen(0.02, 1.7), living.motions)
-    assert refined.scale.policy == "fixed" and refined.scale.log_mean == living.motions.scale_log_mean
-    assert refined.fallback_reason or refined.imu.inflation > 50
-    assert gain(refined) < 1.2
-    assert np.nanmean(nees(refined.trajectory, refined.truth)) < 4
