@@ -21,6 +21,10 @@ SATURATION_INFLATION = 50.0
 """Factor on a sensor's density in intervals where one of its axes sits at full scale."""
 HOLE_RATIO = 1.5
 """Sample spacing over the nominal one above which an interval's noise is inflated."""
+UNCHECKED = 3.0
+"""Factor on the noise of motions in an IMU gap: one motion in fifty that is ten degrees off, spread over all."""
+CARRIED_S = 10.0
+"""For which inertial samples alone carry a position; after it, half a metre is lost."""
 BIAS_FRAMES = 3000
 """Frames used for the robust initial gyro bias."""
 
@@ -37,7 +41,7 @@ class Problem:
     pieces: ImuPieces
     """IMU of the M-1 intervals."""
     imu_usable: NDArray[np.bool_]
-    """(M-1,) False where a gap makes the interval's inertial factor worthless."""
+    """(M-1,) False where a gap, or a long stretch without motions, makes the interval's inertial factor worthless."""
     gaps: tuple[Gap, ...]
     accel_inflation: Array
     """(M-1,) factor on the accelerometer density: missing samples, vibration inside a sample."""
@@ -53,6 +57,8 @@ class Problem:
     """What `pieces` were cut from, whole recording."""
     imu_t_s: Array
     """(S,) their stamps on the frames' clock."""
+    motion_noise: tuple[float, float] = (1.0, 1.0)
+    """Factors on the noise of rotation and translation that the motions claimed; already in `motions`."""
 
     @property
     def dt_s(self) -> Array:
@@ -79,6 +85,8 @@ def build_problem(recording: Recording, motions: RelativeMotions) -> Problem:
     batch = make_motions(i - lo, j - lo, motions.T_i_j, motions.cov, recording.calibration.T_body_camera)
     usable = _usable(t, gaps)
     gyro_bias = _initial_gyro_bias(split_at_frames(recording.imu, imu_t, t), batch, np.diff(t), usable)
+    batch = _unchecked(batch, usable)
+    usable &= ~_blind(batch, t)
     pieces = split_at_frames(recording.imu, imu_t, t, gyro_bias)
     noise = recording.calibration.imu_noise
     holes = _hole_inflation(pieces, imu_t)
@@ -107,6 +115,21 @@ def _usable(t: Array, gaps: tuple[Gap, ...]) -> NDArray[np.bool_]:
     for gap in gaps:
         usable &= (t[1:] <= gap.start_s) | (t[:-1] >= gap.end_s)
     return usable
+
+
+def _unchecked(motions: ScaledMotions, usable: NDArray[np.bool_]) -> ScaledMotions:
+    """Where the IMU is missing nothing tells an outlier from motion: what is measured there counts less."""
+    missing = np.concatenate([[0], np.cumsum(~usable)])
+    alone = missing[motions.j] > missing[motions.i]
+    return replace(motions, whiten=motions.whiten / np.where(alone, UNCHECKED, 1.0)[:, None, None])
+
+
+def _blind(motions: ScaledMotions, t: Array) -> NDArray[np.bool_]:
+    """(M-1,) intervals over which the IMU alone would have to carry the position, and cannot."""
+    crossed = np.zeros(len(t))
+    np.add.at(crossed, motions.i, 1.0)
+    np.add.at(crossed, motions.j, -1.0)
+    return np.asarray((np.diff(t) > CARRIED_S) & (np.cumsum(crossed)[:-1] == 0))
 
 
 def _hole_inflation(pieces: ImuPieces, imu_t_s: Array) -> Array:

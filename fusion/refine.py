@@ -5,6 +5,7 @@ from __future__ import annotations
 import resource
 import sys
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,7 +15,8 @@ from fusion.ekf import ekf_estimate
 from fusion.estimate import Estimate, motions_estimate
 from fusion.graph_estimator import GraphEstimator
 from fusion.initialization import level_rotation
-from fusion.problem import Problem, build_problem
+from fusion.prepare import prepare
+from fusion.problem import Problem
 from fusion.result import Estimator, ImuConclusion, Refinement, View
 from fusion.stages import Stages
 from vio import se3
@@ -48,9 +50,10 @@ def refine(recording: Recording, motions: RelativeMotions, config: RefineConfig 
     config = config or RefineConfig()
     stages = Stages(announce)
     with stages("checks"):
-        problem = build_problem(recording, motions)
+        recording, problem, camera_imu = prepare(recording, motions)
     estimate, estimator, reason = _first_that_works(problem, motions, config, stages)
-    return _conclude(recording, motions, problem, estimate, estimator, reason, stages)
+    refined = _conclude(recording, motions, problem, estimate, estimator, reason, stages)
+    return replace(refined, camera_imu=camera_imu)
 
 
 def _first_that_works(problem: Problem, motions: RelativeMotions, config: RefineConfig,
@@ -103,6 +106,7 @@ def _conclude(recording: Recording, motions: RelativeMotions, problem: Problem, 
         trajectory=Trajectory(times, estimate.T_world_body, estimate.cov), velocity_m_s=estimate.velocity_m_s,
         gyro_bias_rad_s=estimate.gyro_bias_rad_s, accel_bias_m_s2=estimate.accel_bias_m_s2,
         log_scale=estimate.log_scale, log_scale_sd=estimate.log_scale_sd, motions_only=only, scale=estimate.scale,
+        motion_noise=(problem.motion_noise[0], problem.motion_noise[1] * estimate.translation_noise),
         imu=ImuConclusion(estimate.imu_chi2_per_dof, estimate.imu_inflation, problem.gaps),
         motions_used=len(motions) - len(estimate.rejected), rejected=estimate.rejected, bridged=bridged,
         time_offset_s=recording.calibration.time_offset_s, truth=_truth(recording, times),

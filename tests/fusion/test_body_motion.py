@@ -1,12 +1,15 @@
 """Motion of the whole body that the IMU feels and the camera does not see."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from fusion import refine
 from fusion.body_motion import _lines, without_body_motion
 from fusion.problem import build_problem, with_accelerometer
-from vio.metrics import ate
+from vio.metrics import ate, nees
+from vio.sensor_faults import with_bias_drift, with_bias_step
 
 RATE_HZ = 40.0
 
@@ -77,3 +80,18 @@ def test_scale_is_no_longer_free_and_the_track_stays_good(examine, amplitude_m, 
     error = ate(refined.trajectory, refined.truth).rmse_m
     assert error < 0.4 * ate(refined.motions_only, refined.truth).rmse_m
     assert abs(refined.scale.log_mean - living.network.true_log_scale.mean()) < 3 * refined.scale.log_sd
+
+
+@pytest.mark.parametrize("spoil", [
+    lambda imu: with_bias_step(imu, 50.0, gyro_rad_s=[0.02, -0.01, 0.01]),
+    lambda imu: with_bias_step(imu, 50.0, accel_m_s2=[0.2, -0.1, 0.1]),
+    lambda imu: with_bias_drift(imu, [0.02, -0.01, 0.01], [0.3, -0.2, 0.2], 100.0),
+], ids=["gyro step", "accelerometer step", "warming up"])
+def test_biases_that_wander_are_followed_and_told(examination, spoil):
+    """Held steady, they cost everything that the IMU gives: the motions' error stayed, 300 times what was claimed."""
+    refined = refine(replace(examination.recording, imu=spoil(examination.recording.imu)), examination.motions)
+    assert refined.estimator == "graph" and refined.scale.policy == "prior"
+    assert "biases that wander" in refined.scale.reason
+    assert ate(refined.trajectory, refined.truth).rmse_m < 0.8 * ate(refined.motions_only, refined.truth).rmse_m
+    assert np.nanmean(nees(refined.trajectory, refined.truth)) < 4
+    assert abs(refined.scale.log_mean - examination.network.true_log_scale.mean()) < 2.5 * refined.scale.log_sd

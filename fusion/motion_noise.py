@@ -1,0 +1,107 @@
+"""Whether the motions' claimed translation noise is right: its variance component, estimated from a solved graph.
+
+With whitened residuals r and redundancy 3 n - tr(P) of the n accepted motions' translations, the claimed noise is wrong
+by the factor sqrt(rᵀr / redundancy) (Förstner, Zeitschrift für Vermessungswesen 104, 1979). P, the part of the errors
+that the estimate follows, is as large as the graph; its trace is that of random probes z: E[zᵀPz] = tr(P) (Hutchinson,
+Comm. Stat. Sim. 18, 1989). One probe costs one linear solve.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import gtsam
+import numpy as np
+from gtsam.symbol_shorthand import S, X
+from numpy.typing import NDArray
+
+from fusion.graph import read_poses
+from fusion.scaled_motion import ScaledMotions, linearize
+from fusion.solve import MotionTerm, linear_graph
+from vio.errors import EstimationError
+
+Array = NDArray[np.float64]
+
+PROBED_MOTIONS = 4000
+"""Motions times probes: the factor is then known to a few percent."""
+LEAST_REDUNDANCY = 30.0
+"""Below, the data do not tell the motions' noise from the capsule's motion."""
+LEAST_MOTIONS = 50
+LARGEST = 10.0
+"""Factor, up or down, beyond which it is no longer a noise card that is wrong."""
+RIGHT = (0.8, 1.25)
+"""Factors that are left alone."""
+
+
+def is_right(factor: float) -> bool:
+    """Whether claimed noise that is wrong by this factor may stay."""
+    return RIGHT[0] <= factor <= RIGHT[1]
+
+
+def bounded(factor: float) -> float:
+    """A factor that a noise card can be wrong by."""
+    return float(np.clip(factor, 1 / LARGEST, LARGEST))
+
+
+def with_noise(motions: ScaledMotions, rotation: float, translation: float) -> ScaledMotions:
+    """The motions with their noise multiplied: standard deviations of rotation and translation."""
+    return replace(motions, whiten=motions.whiten / np.repeat([rotation, translation], 3))
+
+
+def translation_noise(native: gtsam.NonlinearFactorGraph, values: gtsam.Values, term: MotionTerm,
+                      rng: np.random.Generator) -> float:
+    """Real over claimed standard deviation of the translations; 1 where the data do not tell.
+
+    Args:
+        native: all other factors.
+        values: their common solution.
+        term: the motions as they were solved; those with weight below 1 are left out.
+        rng: source of the probes.
+
+    Raises:
+        EstimationError: the linear system has no unique solution.
+    """
+    accepted = term.weight == 1.0
+    if accepted.sum() < LEAST_MOTIONS:
+        return 1.0
+    blocks = linearize(term.motions, *read_poses(values), term.log_scale(values))
+    residual2 = float((blocks.b[accepted, 3:] ** 2).sum())
+    gaussian = linear_graph(native, values, term)
+    ordering = gtsam.Ordering.MetisGaussianFactorGraph(gaussian)
+    still = _solved(gaussian, ordering)
+    probes = max(1, round(PROBED_MOTIONS / len(term.motions)))
+    followed = 0.0
+    for _ in range(probes):
+        z = rng.standard_normal((len(term.motions), 3)) * accepted[:, None]
+        moved = _solved(linear_graph(native, values, _shifted(term, z)), ordering)
+        response = _response(blocks.A_i, blocks.A_j, blocks.A_s, term, still, moved)
+        followed += float((z * response)[accepted].sum()) / probes
+    redundancy = 3 * int(accepted.sum()) - followed
+    return bounded(np.sqrt(residual2 / redundancy)) if redundancy > LEAST_REDUNDANCY else 1.0
+
+
+def _shifted(term: MotionTerm, z: Array) -> MotionTerm:
+    """The term whose measured translations are larger by whitened amounts z (N, 3); Jacobians stay as they are."""
+    motions = term.motions
+    error = np.linalg.solve(motions.whiten[:, 3:, 3:], z[:, :, None])
+    return replace(term, motions=replace(motions, t=motions.t + (motions.R @ error)[:, :, 0]))
+
+
+def _solved(gaussian: gtsam.GaussianFactorGraph, ordering: gtsam.Ordering) -> gtsam.VectorValues:
+    try:
+        return gaussian.optimize(ordering)
+    except RuntimeError as error:
+        reason = str(error).strip().splitlines()[0]
+        raise EstimationError(f"graph: the motions' noise cannot be estimated ({reason})") from None
+
+
+def _response(A_i: Array, A_j: Array, A_s: Array, term: MotionTerm, still: gtsam.VectorValues,
+              moved: gtsam.VectorValues) -> Array:
+    """(N, 3) change of the predicted whitened translations."""
+    nodes = np.arange(int(max(term.motions.i.max(), term.motions.j.max())) + 1) + term.first_node
+    dx = np.array([moved.at(X(k)) - still.at(X(k)) for k in nodes])
+    change = (A_i[:, 3:] @ dx[term.motions.i][:, :, None] + A_j[:, 3:] @ dx[term.motions.j][:, :, None])[:, :, 0]
+    if term.segment is not None:
+        ds = np.array([moved.at(S(k)) - still.at(S(k)) for k in range(term.segments)])[:, 0]
+        change = change + A_s[:, 3:, 0] * ds[term.segment][:, None]
+    return np.asarray(change)
