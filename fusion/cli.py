@@ -226,6 +226,7 @@ def _refine(arguments: argparse.Namespace) -> int:
     from fusion.refine import refine
     from fusion.run_folder import Provenance, write_run
     from vio.formats import open_recording
+    from vio.motion_sources import merge_motions
     from vio.motions import load_motions
 
     config = RefineConfig() if arguments.config is None else load_config(arguments.config)
@@ -235,8 +236,9 @@ def _refine(arguments: argparse.Namespace) -> int:
     inputs = {"imu": arguments.recording / "mav0" / "imu0" / "data.csv",
               "frames": arguments.recording / "mav0" / "cam0" / "data.csv"}
     if arguments.motions is not None:
-        motions = load_motions(arguments.motions)
-        inputs["motions"] = arguments.motions
+        sources = [load_motions(path) for path in arguments.motions]
+        motions = sources[0] if len(sources) == 1 else merge_motions(sources).motions
+        inputs |= {"motions" if k == 0 else f"motions_{k + 1}": path for k, path in enumerate(arguments.motions)}
     else:
         import learned
 

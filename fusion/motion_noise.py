@@ -29,6 +29,7 @@ LEAST_REDUNDANCY = 30.0
 LEAST_MOTIONS = 50
 LARGEST = 10.0
 """Factor, up or down, beyond which it is no longer a noise card that is wrong."""
+ONCE = 0.9
 RIGHT = (0.8, 1.25)
 """Factors that are left alone."""
 
@@ -36,6 +37,16 @@ RIGHT = (0.8, 1.25)
 def is_right(factor: float) -> bool:
     """Whether claimed noise that is wrong by this factor may stay."""
     return RIGHT[0] <= factor <= RIGHT[1]
+
+
+def measured_once(motions: ScaledMotions) -> bool:
+    """Whether hardly a pair of frames was measured twice.
+
+    Sources that share errors are closer to each other than to the truth, and carry covariances widened for it: their
+    residuals would make the noise look smaller than it is.
+    """
+    pairs = np.unique(np.column_stack([motions.i, motions.j]), axis=0)
+    return len(pairs) > ONCE * len(motions)
 
 
 def bounded(factor: float) -> float:
@@ -62,7 +73,7 @@ def translation_noise(native: gtsam.NonlinearFactorGraph, values: gtsam.Values, 
         EstimationError: the linear system has no unique solution.
     """
     accepted = term.weight == 1.0
-    if accepted.sum() < LEAST_MOTIONS:
+    if accepted.sum() < LEAST_MOTIONS or not measured_once(term.motions):
         return 1.0
     blocks = linearize(term.motions, *read_poses(values), term.log_scale(values))
     residual2 = float((blocks.b[accepted, 3:] ** 2).sum())

@@ -8,7 +8,7 @@ import numpy as np
 
 from fusion.camera_imu import CameraImu, check_clock, compared_pairs, measure_camera_imu
 from fusion.motion_checks import check_against_gyro
-from fusion.motion_noise import bounded, is_right, with_noise
+from fusion.motion_noise import bounded, is_right, measured_once, with_noise
 from fusion.problem import Problem, build_problem
 from vio import se3
 from vio.calibration import Calibration
@@ -38,7 +38,7 @@ def prepare(recording: Recording, motions: RelativeMotions) -> tuple[Recording, 
         recording = replace(recording, calibration=corrected)
         problem = build_problem(recording, motions)
         measured = replace(measured, applied=True, reason="corrected: " + " and ".join(reasons))
-    if not is_right(measured.rotation_noise):
+    if not is_right(measured.rotation_noise) and measured_once(problem.motions):
         factor = bounded(measured.rotation_noise)  # likeliest one wrong figure; the graph checks translations
         problem = replace(problem, motions=with_noise(problem.motions, factor, factor), motion_noise=(factor, factor))
     return recording, problem, measured

@@ -11,8 +11,9 @@ from vio import se3
 from vio.consistency import coverage, fix_gauge, nees
 from vio.errors import EstimationError
 from vio.metrics import ate
+from vio.motion_sources import merge_motions
 from vio.motions import RelativeMotions
-from vio.simulation import T_BODY_CAMERA
+from vio.simulation import T_BODY_CAMERA, network_like_motions
 
 # Held out: no threshold of fusion was chosen on these seeds.
 HELD_OUT = [("small-bowel", "gaussian", 3, 301), ("colon", "collision", 3, 302), ("stomach", "peristalsis", 4, 303),
@@ -313,3 +314,17 @@ def test_a_vague_prior_is_searched(examination, off, sd):
     assert refined.scale.policy == "free"
     assert abs(refined.scale.log_mean - examination.network.true_log_scale.mean()) < 0.1
     assert gain(refined) < 0.3
+
+
+def test_two_sources_beat_either_and_one_given_twice_gains_nothing(examination, refined):
+    """A second network with noise of its own, in a unit of its own."""
+    truth = examination.recording.truth_at_frames()
+    other = network_like_motions(truth, T_BODY_CAMERA, 77, scale_log_mean=np.log(2.0)).motions
+    merged = merge_motions([examination.motions, other])
+    both = refine(examination.recording, merged.motions)
+    alone = refine(examination.recording, other)
+    assert merged.correlation[0, 1] < 0.15
+    sd = [np.sqrt(r.trajectory.cov[-1, 3:, 3:].trace()) for r in (both, refined, alone)]
+    assert sd[0] < 0.9 * min(sd[1:]) and np.nanmean(nees(both.trajectory, both.truth)) < 3
+    twice = refine(examination.recording, merge_motions([examination.motions] * 2).motions)
+    assert np.sqrt(twice.trajectory.cov[-1, 3:, 3:].trace()) == pytest.approx(sd[1], rel=0.1)
