@@ -131,14 +131,23 @@ def compared_pairs(problem: Problem, most: int = MOST_PAIRS, where: float = 0.5)
         most: consecutive ones that are taken.
         where: of those there are, 0 the first, 1 the last.
     """
+    return _pairs_at(problem, *_comparable(problem), most, where)
+
+
+def _comparable(problem: Problem) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """The surest motion from every node (M-1,), and the nodes (K,) where it can be compared."""
     surest = problem.motions.surest_neighbours(len(problem))
     calm = problem.imu_usable & (problem.gyro_inflation < SHAKEN)
-    node = np.flatnonzero((surest >= 0) & calm)
+    return surest, np.flatnonzero((surest >= 0) & calm)
+
+
+def _pairs_at(problem: Problem, surest: NDArray[np.int64], node: NDArray[np.int64], most: int, where: float) -> Pairs:
     begin = int(where * max(len(node) - most, 0))
     node = node[begin : begin + most]
     chosen = surest[node]
-    gyro = preintegrate_rotation(_pieces(problem, node, 0.0), np.zeros(3))[node - node[0]] if len(node) else \
-        np.zeros((0, 3, 3))
+    gyro = np.zeros((0, 3, 3))
+    if len(node):
+        gyro = preintegrate_rotation(_pieces(problem, node, 0.0), np.zeros(3))[node - node[0]]
     return Pairs(node, problem.motions.R[chosen], problem.motions.whiten[chosen, :3, :3], gyro)
 
 
@@ -182,10 +191,11 @@ def check_clock(problem: Problem) -> None:
     Raises:
         ImuError: naming the jump and between which times it lies.
     """
-    stretches = min(MOST_STRETCHES, int((problem.motions.j - problem.motions.i == 1).sum()) // STRETCH_PAIRS)
+    surest, node = _comparable(problem)
+    stretches = min(MOST_STRETCHES, len(node) // STRETCH_PAIRS)
     before: tuple[float, CameraImu] | None = None
     for k in range(stretches):
-        pairs = compared_pairs(problem, STRETCH_PAIRS, k / max(stretches - 1, 1))
+        pairs = _pairs_at(problem, surest, node, STRETCH_PAIRS, k / max(stretches - 1, 1))
         found = measure_camera_imu(problem, pairs)
         if found.pairs == 0 or not found.time_offset_sd_s < KNOWN_OFFSET_S:
             continue

@@ -88,7 +88,8 @@ def reasons_against(free: FreePass, problem: Problem, config: ScaleConfig) -> st
     """Why the freed scale must not be believed; None when it may."""
     if free.imu_chi2 > config.imu_chi2_limit:
         return (f"the IMU disagrees with the motions even with free scale (chi² {free.imu_chi2:.2f} per dof, "
-                f"limit {config.imu_chi2_limit:g}): the body moves in ways the camera does not see")
+                f"limit {config.imu_chi2_limit:g}): the body moves in ways the camera does not see, or the IMU is not "
+                "what its calibration says")
     moved = abs(float(free.log_scale.mean()) - problem.scale_log_mean)
     allowed = PLAUSIBLE_SDS * problem.scale_log_sd + 3 * float(free.log_scale_sd.mean())
     if moved > allowed:
