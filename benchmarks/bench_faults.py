@@ -89,10 +89,11 @@ def shuffled(case: Case) -> Case:
 def faults(duration_s: float) -> dict[str, Callable[[Case], Case]]:
     """Every fault by name."""
     half = 0.5 * duration_s
+    missing_s = min(600.0, half)
     out: dict[str, Callable[[Case], Case]] = {
         "none": lambda case: case,
         "IMU silent for 60 s": imu(with_gap, half, 60.0),
-        "10 minutes of frames missing": lambda case: frames_missing(case, 0.3 * duration_s, min(600.0, half)),
+        f"{missing_s:g} s of frames missing": lambda case: frames_missing(case, 0.3 * duration_s, missing_s),
         "IMU clock jumps by 0.3 s": imu(with_clock_jump, half, 0.3),
         "IMU clock 50 ms off": imu(with_time_shift, 0.05),
         "gyro bias steps by 1.4 deg/s": imu(with_bias_step, half, gyro_rad_s=GYRO_STEP),
