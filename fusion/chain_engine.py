@@ -11,7 +11,7 @@ from fusion.chain_model import ChainModel, ScaleWalk
 from fusion.chain_solve import chain_gauss_newton
 from fusion.chain_start import chain_start, inertial_steps
 from fusion.config import RefineConfig
-from fusion.engine import Begin, Uncertainty
+from fusion.engine import Begin, Step, Uncertainty
 from fusion.problem import Problem
 from fusion.scale import Segments
 from fusion.solve import MotionTerm, Solution
@@ -56,3 +56,9 @@ class ChainEngine:
             begins = np.flatnonzero(np.diff(segments.of_node, prepend=-1))
             variance = cov[begins, 0, 0]
         return Uncertainty(np.ascontiguousarray(cov[:, POSE, POSE]), variance, joint)
+
+    def step(self, begin: Begin, term: MotionTerm) -> Step:
+        """One step, not taken."""
+        x = begin.model.linearize(begin.values, term).factor().solve()
+        scale = np.zeros(len(term.motions)) if term.segment is None else x[term.motions.i, 0]
+        return Step(np.ascontiguousarray(x[:, POSE]), scale)

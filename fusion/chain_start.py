@@ -12,7 +12,14 @@ from fusion.chain_model import ChainModel
 from fusion.chain_solve import chain_gauss_newton
 from fusion.chain_state import ChainState
 from fusion.config import RefineConfig
-from fusion.graph import BLIND_SPEED_M_S, GAP_VELOCITY_SD_M_S_RTS, Anchor, first_anchor
+from fusion.graph import (
+    BLIND_GYRO_RAD_S,
+    BLIND_SPEED_M_S,
+    GAP_VELOCITY_SD_M_S_RTS,
+    Anchor,
+    first_anchor,
+    gyro_covers,
+)
 from fusion.inertial import InertialSteps, preintegrate_steps
 from fusion.initialization import (
     CARRIED_BIAS_SD,
@@ -55,11 +62,13 @@ def inertial_steps(problem: Problem, accel_inflation: float = 1.0) -> InertialSt
     np.add.at(spanned, problem.motions.j, -1)
     measured = np.cumsum(spanned)[:-2] > 0
     for k in gap:
-        steps.R[k] = np.eye(3)
+        dt, carried = steps.dt_s[k], not measured[k] and gyro_covers(problem, k)
+        if not carried:
+            steps.R[k] = np.eye(3)
         for values in (steps.v, steps.p, steps.R_bg, steps.v_bg, steps.v_ba, steps.p_bg, steps.p_ba):
             values[k] = 0.0
-        dt = steps.dt_s[k]
-        pose = [UNKNOWN] * 2 if measured[k] else [1 / np.pi, 1 / (BLIND_SPEED_M_S * dt)]
+        turn_sd = min(BLIND_GYRO_RAD_S * dt, np.pi) if carried else np.pi
+        pose = [UNKNOWN] * 2 if measured[k] else [1 / turn_sd, 1 / (BLIND_SPEED_M_S * dt)]
         steps.whiten[k] = np.diag(np.repeat([pose[0], 1 / (GAP_VELOCITY_SD_M_S_RTS * np.sqrt(dt)), pose[1]], 3))
         steps.free_fall[k] = 0.0
     return steps

@@ -24,7 +24,7 @@ from fusion.chain_model import ChainModel
 from fusion.chain_start import inertial_steps
 from fusion.chain_state import ChainState
 from fusion.config import RefineConfig
-from fusion.engine import Begin, Uncertainty
+from fusion.engine import Begin, Step, Uncertainty
 from fusion.graph import Anchor
 from fusion.joint import JointSamples
 from fusion.preintegration import make_bias
@@ -169,6 +169,10 @@ class ResumableEngine:
         self.checkpoint.save(name, {"cov": found.cov, "variance": found.log_scale_variance, "node": found.joint.node,
                                     "xi": found.joint.xi, "log_scale": found.joint.log_scale})
         return found
+
+    def step(self, begin: Begin, term: MotionTerm) -> Step:
+        """As `ChainEngine.step`; quicker to compute again than to store."""
+        return self.engine.step(begin, term)
 
     def _next(self, kind: str) -> str:
         self._calls += 1

@@ -225,8 +225,9 @@ def _refine(arguments: argparse.Namespace) -> int:
         config = replace(config, estimator=arguments.estimator)
     recording = open_recording(arguments.recording)
     inputs = {"imu": arguments.recording / "mav0" / "imu0" / "data.csv",
-              "frames": arguments.recording / "mav0" / "cam0" / "data.csv", "motions": arguments.motions}
-    inputs = {name: path for name, path in inputs.items() if path is not None and path.is_file()}
+              "frames": arguments.recording / "mav0" / "cam0" / "data.csv"}
+    inputs |= {"motions" if k == 0 else f"motions_{k + 1}": path for k, path in enumerate(arguments.motions or ())}
+    inputs = {name: path for name, path in inputs.items() if path.is_file()}
     with unfinished(arguments.out) as kept:
         motions = _motions(arguments, recording, inputs, kept)
         with Progress(remaining_s) as progress:
@@ -252,10 +253,12 @@ def _motions(arguments: argparse.Namespace, recording: Recording, inputs: dict[s
     """The motions that were given, or measured by the network and kept until the run is written."""
     from fusion.checkpoint import Checkpoint, digest
     from fusion.run_folder import sha256_of
+    from vio.motion_sources import merge_motions
     from vio.motions import load_motions
 
     if arguments.motions is not None:
-        return load_motions(arguments.motions)
+        sources = [load_motions(path) for path in arguments.motions]
+        return sources[0] if len(sources) == 1 else merge_motions(sources).motions
     import learned
 
     weights = "bundled" if arguments.weights is None else sha256_of(arguments.weights)

@@ -165,7 +165,8 @@ def _refine(commands: Commands) -> None:
                       "refine REC --motions motions.npz --out RUN")
     parser.add_argument("recording", type=Path, metavar="REC")
     source = parser.add_mutually_exclusive_group()
-    source.add_argument("--motions", type=Path, metavar="motions.npz", help="motions from any source")
+    source.add_argument("--motions", type=Path, nargs="+", metavar="motions.npz",
+                        help="motions from any source; of several, the first one's unit is kept")
     source.add_argument("--weights", type=Path, metavar="W", help="predict the motions with these weights")
     how = parser.add_mutually_exclusive_group()
     how.add_argument("--estimator", choices=("auto", "graph", "ekf"), help="default: the configuration's, auto")

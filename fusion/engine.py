@@ -42,6 +42,16 @@ class Uncertainty:
     """None where it could not be sampled."""
 
 
+@dataclass(frozen=True)
+class Step:
+    """A Gauss-Newton step."""
+
+    pose: Array
+    """(M, 6) of the poses, body axes, rotation first."""
+    scale: Array
+    """(N,) of the log scale that applies to every motion; zero where scale is held."""
+
+
 class Engine(Protocol):
     """Builds and solves; raises `EstimationError` where it cannot."""
 
@@ -61,4 +71,8 @@ class Engine(Protocol):
     def uncertainty(self, begin: Begin, term: MotionTerm, segments: Segments | None,
                     rng: np.random.Generator) -> Uncertainty:
         """Covariances at `begin.values`; segments are None where scale is held."""
+        ...
+
+    def step(self, begin: Begin, term: MotionTerm) -> Step:
+        """One step from `begin.values`, not taken."""
         ...

@@ -43,6 +43,8 @@ class Estimate:
     """How the errors of all poses hang together; None where it could not be sampled."""
     notes: tuple[str, ...] = ()
     """Where less than the whole of the estimator was used, and why."""
+    translation_noise: float = 1.0
+    """Factor by which the problem's noise of the translations was corrected; 1 where it was kept."""
 
 
 def add_scale_uncertainty(T_world_body: Array, cov: Array, log_scale_sd: float, T_body_camera: Array) -> Array:

@@ -23,10 +23,12 @@ Values: TypeAlias = "gtsam.Values | ChainState"
 
 ANCHOR_SD_M, ANCHOR_SD_YAW_RAD = 1e-5, 1e-5
 """The first pose defines the world's origin and yaw; the sds only keep the system well conditioned."""
-GAP_VELOCITY_SD_M_S_RTS = 0.05
+GAP_VELOCITY_SD_M_S_RTS = 0.02
 """Random walk of the velocity where the IMU is missing [m/s/sqrt(s)]."""
-BLIND_SPEED_M_S = 1.0
-"""Speed bound where neither IMU nor motion speaks; keeps the graph connected without pretending to know."""
+BLIND_SPEED_M_S = 0.02
+"""Sd of the mean velocity where neither IMU nor motion speaks: a capsule hardly travels faster for long."""
+BLIND_GYRO_RAD_S = 2e-4
+"""Sd of the gyro's bias where it alone carries the attitude over a long stretch."""
 
 
 @dataclass(frozen=True)
@@ -88,10 +90,11 @@ def add_imu(graph: gtsam.NonlinearFactorGraph, measurements: list[gtsam.Preinteg
         if problem.imu_usable[k]:
             graph.add(gtsam.CombinedImuFactor(X(k), V(k), X(k + 1), V(k + 1), B(k), B(k + 1), measurement))
         else:
-            _add_gap_link(graph, problem, k)
+            _add_gap_link(graph, problem, k, measurement)
 
 
-def _add_gap_link(graph: gtsam.NonlinearFactorGraph, problem: Problem, k: int) -> None:
+def _add_gap_link(graph: gtsam.NonlinearFactorGraph, problem: Problem, k: int,
+                  measurement: gtsam.PreintegratedCombinedMeasurements) -> None:
     dt, noise = float(problem.dt_s[k]), problem.noise
     root = np.sqrt(dt)
     walk = np.array([noise.accel_walk_m_s3_rthz] * 3 + [noise.gyro_walk_rad_s2_rthz] * 3) * root
@@ -100,8 +103,15 @@ def _add_gap_link(graph: gtsam.NonlinearFactorGraph, problem: Problem, k: int) -
     graph.add(gtsam.BetweenFactorConstantBias(B(k), B(k + 1), gtsam.imuBias.ConstantBias(), diagonal(walk)))
     measured = ((problem.motions.i <= k) & (problem.motions.j > k)).any()
     if not measured:
-        sigmas = np.array([np.pi] * 3 + [BLIND_SPEED_M_S * dt] * 3)
-        graph.add(gtsam.BetweenFactorPose3(X(k), X(k + 1), gtsam.Pose3(), diagonal(sigmas)))
+        turned = gtsam.Pose3(measurement.deltaRij(), np.zeros(3)) if gyro_covers(problem, k) else gtsam.Pose3()
+        turn_sd = BLIND_GYRO_RAD_S * dt if gyro_covers(problem, k) else np.pi
+        sigmas = np.array([min(turn_sd, np.pi)] * 3 + [BLIND_SPEED_M_S * dt] * 3)
+        graph.add(gtsam.BetweenFactorPose3(X(k), X(k + 1), turned, diagonal(sigmas)))
+
+
+def gyro_covers(problem: Problem, k: int) -> bool:
+    """Whether no hole of the IMU touches interval k."""
+    return not any(gap.start_s < problem.t_s[k + 1] and gap.end_s > problem.t_s[k] for gap in problem.gaps)
 
 
 def add_scale_walk(graph: gtsam.NonlinearFactorGraph, segment_t_s: Array, log_mean: float, log_sd: float,

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusion import scale as scale_policy
+from fusion.body_motion import BodyMotion, without_body_motion
 from fusion.chain_engine import ChainEngine
 from fusion.checkpoint import Checkpoint, ResumableEngine
 from fusion.config import RefineConfig
@@ -17,6 +18,7 @@ from fusion.estimate import Estimate, add_scale_uncertainty
 from fusion.graph import read_log_scales, read_states
 from fusion.initialization import search_log_scale
 from fusion.joint import SEED, with_assumed_scale
+from fusion.motion_noise import is_right, translation_noise, with_noise
 from fusion.native_engine import NativeEngine
 from fusion.problem import Problem
 from fusion.result import ScaleConclusion, ScalePolicy
@@ -33,6 +35,8 @@ COARSE_TOLERANCE = 2e-2
 GATED_SHARE = 0.1
 """A rejected motion weighs this over its squared norm: the true step still lies within a few of its errors."""
 GATE_ROUNDS = 3
+NOISE_ROUNDS, SETTLED = 5, 0.07
+"""How often the motions' noise may be corrected, and by how little at last."""
 
 
 @dataclass(frozen=True)
@@ -79,14 +83,31 @@ class GraphEstimator:
             return replace(self._estimate(), notes=(*self.notes, f"{error}; solved by gtsam"))
 
     def _estimate(self) -> Estimate:
+        """The recipe, repeated where the motions' noise turns out to be claimed wrongly."""
+        given, noise = self.problem, 1.0
+        for _ in range(NOISE_ROUNDS):
+            final, conclusion, fixed_chi2, inflation = self._solve()
+            with self.stages("motion_noise"):
+                factor = translation_noise(self.engine, Begin(final.model, final.solution.values), final.term,
+                                           np.random.default_rng(SEED))
+            if is_right(factor) if noise == 1.0 else abs(factor - 1) < SETTLED:
+                break
+            noise *= factor
+            self.problem = replace(given, motions=with_noise(given.motions, 1.0, noise))
+        else:
+            final, conclusion, fixed_chi2, inflation = self._solve()
+        with self.stages("covariances"):
+            return replace(self._read(final, conclusion, fixed_chi2, inflation), translation_noise=noise)
+
+    def _solve(self) -> tuple[_Pass, ScaleConclusion, float, float]:
+        """Solution, what it says of scale, the IMU's chi² at fixed scale and the accelerometer's inflation."""
         start_scale = self._start_scale()
         with self.stages("initialization"):
             start = self._trusted_start(start_scale)
         with self.stages("fixed_scale"):
             fixed = self._fixed_pass(start, start_scale)
         final, conclusion, inflation = self._decide(fixed, start_scale)
-        with self.stages("covariances"):
-            return self._read(final, conclusion, fixed.imu_chi2, inflation)
+        return final, conclusion, fixed.imu_chi2, inflation
 
     def _check_solvable(self) -> None:
         if not self.problem.imu_usable.any():
@@ -145,28 +166,41 @@ class GraphEstimator:
         return self._down_weighted(start_scale, objection)
 
     def _down_weighted(self, start_scale: float, why: str) -> tuple[_Pass, ScaleConclusion, float]:
-        """Raise the accelerometer's noise until it agrees, with scale near its prior; in the end hold the scale."""
-        for inflation in scale_policy.INFLATION_LADDER:
+        """Take periodic motion of the body out of the accelerometer, let biases wander, then raise its noise."""
+        noise = self.problem.noise
+        with self.stages("accelerometer_down_weighted"):
+            loose = self._fixed_pass(self._start(start_scale, scale_policy.LOOSE), start_scale)
+            self.problem, motion = self._without_body_motion(loose)
+        if motion.hz > 0:
+            why = f"{why}; a sway of the body of {1e3 * motion.amplitude_m:.2g} mm at {motion.hz:.2g} Hz was taken out"
+        for remedy in scale_policy.remedies(motion, noise):
+            self.problem = replace(self.problem, noise=remedy.noise)
             with self.stages("accelerometer_down_weighted"):
-                start = self._start(start_scale, inflation)
-                fixed = self._fixed_pass(start, start_scale)
+                fixed = self._fixed_pass(self._start(start_scale, remedy.inflation), start_scale)
             if fixed.imu_chi2 > scale_policy.CALM_CHI2:
                 continue
             final, free = self._free_pass(fixed, start_scale)
             if scale_policy.reasons_against(free, self.problem, self.config.scale) is None:
-                reason = f"scale near its prior, accelerometer noise × {inflation:g}: {why}"
-                conclusion = scale_policy.conclude_free(free, self.problem)
-                return final, replace(conclusion, policy="prior", reason=reason), inflation
+                reason = f"scale near its prior, {remedy.words}: {why}"
+                conclusion = scale_policy.widened(scale_policy.conclude_free(free, self.problem), motion, remedy)
+                return final, replace(conclusion, policy="prior", reason=reason), remedy.inflation
         with self.stages("accelerometer_down_weighted"):
             fixed = self._fixed_pass(self._start(start_scale, scale_policy.GRAVITY_ONLY), start_scale)
         reason = f"held at the prior, the accelerometer serves for the direction of gravity only: {why}"
         return self._held(fixed, "fixed", start_scale, reason, scale_policy.GRAVITY_ONLY)
 
+    def _without_body_motion(self, loose: _Pass) -> tuple[Problem, BodyMotion]:
+        states, motions = read_states(loose.solution.values, 0, len(self.problem)), self.problem.motions
+        trusted = np.zeros(len(self.problem) - 1, bool)
+        trusted[motions.i[loose.solution.squared_norm < self.config.robust.gate]] = True
+        return without_body_motion(self.problem, states.R, states.p, states.accel_bias, states.gyro_bias, trusted)
+
     def _held(self, fixed: _Pass, policy: ScalePolicy, log_scale: float, reason: str,
               inflation: float) -> tuple[_Pass, ScaleConclusion, float]:
         with self.stages("gate"):
             final = self._gated(fixed)
-        return final, ScaleConclusion(policy, log_scale, self.problem.scale_log_sd, reason), inflation
+        sd = scale_policy.assumed_sd(self.problem, self.config.scale)
+        return final, ScaleConclusion(policy, log_scale, sd, reason, assumed_sd=sd), inflation
 
     def _free_pass(self, fixed: _Pass, start_scale: float) -> tuple[_Pass, FreePass]:
         count = len(self.segments.t_s)
@@ -213,15 +247,16 @@ class GraphEstimator:
         cov, joint = uncertainty.cov, uncertainty.joint
         states = read_states(final.solution.values, 0, m)
         T = states.T_world_body
+        assumed, T_body_camera = conclusion.assumed_sd, self.problem.motions.T_body_camera
         if estimated:
             of_node = self.segments.of_node
             log_scale = read_log_scales(final.solution.values, segments)[of_node]
-            log_scale_sd = np.sqrt(uncertainty.log_scale_variance)[of_node]
+            log_scale_sd = np.sqrt(uncertainty.log_scale_variance[of_node] + assumed**2)
         else:
             log_scale, log_scale_sd = np.full(m, conclusion.log_mean), np.full(m, conclusion.log_sd)
-            T_body_camera = self.problem.motions.T_body_camera
-            cov = add_scale_uncertainty(T, cov, conclusion.log_sd, T_body_camera)
+        if assumed > 0:
+            cov = add_scale_uncertainty(T, cov, assumed, T_body_camera)
             joint = None if joint is None else with_assumed_scale(
-                joint, T, conclusion.log_sd, T_body_camera, np.random.default_rng(SEED + 1))
+                joint, T, assumed, T_body_camera, np.random.default_rng(SEED + 1))
         return Estimate(T, cov, states.v, states.gyro_bias, states.accel_bias, log_scale, log_scale_sd, conclusion,
                         final.rejected, fixed_chi2, inflation, joint, tuple(self.notes))

@@ -68,7 +68,7 @@ def checkpoints(frames: int) -> NDArray[np.int64]:
 
 def with_assumed_scale(joint: JointSamples, T_world_body: Array, log_scale_sd: float, T_body_camera: Array,
                        rng: np.random.Generator) -> JointSamples:
-    """Samples widened for a scale that was assumed, not estimated: one draw stretches a whole trajectory.
+    """Samples widened for what was assumed about scale, not estimated: one draw stretches a whole trajectory.
 
     As `fusion.estimate.add_scale_uncertainty` does for covariances.
     """
@@ -77,7 +77,7 @@ def with_assumed_scale(joint: JointSamples, T_world_body: Array, log_scale_sd: f
     draw = log_scale_sd * rng.permutation(norm.ppf((np.arange(count) + 0.5) / count))
     xi = joint.xi.copy()
     xi[..., 3:] += draw[:, None, None] * stretch_directions(T_world_body, T_body_camera)[joint.node]
-    return JointSamples(joint.node, xi, np.broadcast_to(draw[:, None], joint.log_scale.shape).copy())
+    return JointSamples(joint.node, xi, joint.log_scale + draw[:, None])
 
 
 def stretch_directions(T_world_body: Array, T_body_camera: Array) -> Array:

@@ -67,7 +67,8 @@ def sample_graph(gaussian: gtsam.GaussianFactorGraph, nodes: int, segment_of_nod
         solved, _ = dtbtrs(lower, white, uplo="L", trans="T")
         draws[first:first + COLUMNS] = (solved[kept] / root[kept, None]).T
     values = draws.reshape(SAMPLES, len(node), 7)
-    return JointSamples(node, values[..., 1:].copy(), values[..., 0].copy())
+    scale = np.zeros(values.shape[:2]) if segment_of_node is None else values[..., 0].copy()
+    return JointSamples(node, values[..., 1:].copy(), scale)
 
 
 def _sample_tree(gaussian: gtsam.GaussianFactorGraph, nodes: int, segment_of_node: Indices | None,

@@ -4,17 +4,17 @@ from __future__ import annotations
 
 import gtsam
 import numpy as np
-from gtsam.symbol_shorthand import S
+from gtsam.symbol_shorthand import S, X
 
 from fusion.config import RefineConfig
 from fusion.covariance import marginal_covariances
-from fusion.engine import Begin, Uncertainty
+from fusion.engine import Begin, Step, Uncertainty
 from fusion.graph import add_anchor, add_imu, add_scale_walk
 from fusion.initialization import chunked_start
 from fusion.joint_graph import sample_graph
 from fusion.problem import Problem
 from fusion.scale import Segments
-from fusion.solve import MotionTerm, Solution, gauss_newton, linear_graph
+from fusion.solve import MotionTerm, Solution, gauss_newton, linear_graph, linear_step
 
 
 class NativeEngine:
@@ -49,3 +49,12 @@ class NativeEngine:
         cov, variance = marginal_covariances(gaussian, nodes, 0 if segments is None else len(segments.t_s))
         joint = sample_graph(gaussian, nodes, None if segments is None else segments.of_node, rng)
         return Uncertainty(cov, variance, joint)
+
+    def step(self, begin: Begin, term: MotionTerm) -> Step:
+        """One step, not taken."""
+        gaussian = linear_graph(begin.model, begin.values, term)
+        delta = linear_step(gaussian, gtsam.Ordering.MetisGaussianFactorGraph(gaussian))
+        pose = np.array([delta.at(X(k)) for k in range(int(term.motions.j.max()) + 1)])
+        if term.segment is None:
+            return Step(pose, np.zeros(len(term.motions)))
+        return Step(pose, np.array([delta.at(S(k))[0] for k in range(term.segments)])[term.segment])

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from fusion.scaled_motion import ScaledMotions, make_motions
 from fusion.vibration import vibration_inflation
 from vio import se3
-from vio.imu import Gap, ImuNoise, ImuPieces, find_gaps, preintegrate_rotation, split_at_frames
+from vio.imu import Gap, ImuNoise, ImuPieces, ImuSamples, find_gaps, preintegrate_rotation, split_at_frames
 from vio.imu_checks import check_imu, saturated_samples
 from vio.motions import RelativeMotions, match_frames
 from vio.recording import Recording, check_refinable
@@ -21,6 +21,10 @@ SATURATION_INFLATION = 50.0
 """Factor on a sensor's density in intervals where one of its axes sits at full scale."""
 HOLE_RATIO = 1.5
 """Sample spacing over the nominal one above which an interval's noise is inflated."""
+UNCHECKED = 3.0
+"""Factor on the noise of motions in an IMU gap: one motion in fifty that is ten degrees off, spread over all."""
+CARRIED_S = 10.0
+"""For which inertial samples alone carry a position; after it, half a metre is lost."""
 BIAS_FRAMES = 3000
 """Frames used for the robust initial gyro bias."""
 
@@ -37,7 +41,7 @@ class Problem:
     pieces: ImuPieces
     """IMU of the M-1 intervals."""
     imu_usable: NDArray[np.bool_]
-    """(M-1,) False where a gap makes the interval's inertial factor worthless."""
+    """(M-1,) False where a gap, or a long stretch without motions, makes the interval's inertial factor worthless."""
     gaps: tuple[Gap, ...]
     accel_inflation: Array
     """(M-1,) factor on the accelerometer density: missing samples, vibration inside a sample."""
@@ -49,6 +53,12 @@ class Problem:
     noise: ImuNoise
     gyro_bias_rad_s: Array
     """(3,) robust initial value: median disagreement of measured and gyro rotation."""
+    samples: ImuSamples
+    """What `pieces` were cut from, whole recording."""
+    imu_t_s: Array
+    """(S,) their stamps on the frames' clock."""
+    motion_noise: tuple[float, float] = (1.0, 1.0)
+    """Factors on the noise of rotation and translation that the motions claimed; already in `motions`."""
 
     @property
     def dt_s(self) -> Array:
@@ -75,6 +85,8 @@ def build_problem(recording: Recording, motions: RelativeMotions) -> Problem:
     batch = make_motions(i - lo, j - lo, motions.T_i_j, motions.cov, recording.calibration.T_body_camera)
     usable = _usable(t, gaps)
     gyro_bias = _initial_gyro_bias(split_at_frames(recording.imu, imu_t, t), batch, np.diff(t), usable)
+    batch = _unchecked(batch, usable)
+    usable &= ~_blind(batch, t)
     pieces = split_at_frames(recording.imu, imu_t, t, gyro_bias)
     noise = recording.calibration.imu_noise
     holes = _hole_inflation(pieces, imu_t)
@@ -85,8 +97,17 @@ def build_problem(recording: Recording, motions: RelativeMotions) -> Problem:
         accel_inflation=holes * clipped[1] * accel_inflation, gyro_inflation=holes * clipped[0] * gyro_inflation,
         motions=batch,
         scale_log_mean=motions.scale_log_mean, scale_log_sd=motions.scale_log_sd, noise=noise,
-        gyro_bias_rad_s=gyro_bias,
+        gyro_bias_rad_s=gyro_bias, samples=recording.imu, imu_t_s=imu_t,
     )
+
+
+def with_accelerometer(problem: Problem, accel_m_s2: Array) -> Problem:
+    """The problem with other specific forces (S, 3): cut anew, and the vibration in them judged anew."""
+    samples = replace(problem.samples, accel_m_s2=accel_m_s2)
+    before, after = (vibration_inflation(imu, problem.imu_t_s, problem.t_s, problem.noise)[0]
+                     for imu in (problem.samples, samples))
+    return replace(problem, samples=samples, accel_inflation=problem.accel_inflation / before * after,
+                   pieces=split_at_frames(samples, problem.imu_t_s, problem.t_s, problem.gyro_bias_rad_s))
 
 
 def _usable(t: Array, gaps: tuple[Gap, ...]) -> NDArray[np.bool_]:
@@ -94,6 +115,21 @@ def _usable(t: Array, gaps: tuple[Gap, ...]) -> NDArray[np.bool_]:
     for gap in gaps:
         usable &= (t[1:] <= gap.start_s) | (t[:-1] >= gap.end_s)
     return usable
+
+
+def _unchecked(motions: ScaledMotions, usable: NDArray[np.bool_]) -> ScaledMotions:
+    """Where the IMU is missing nothing tells an outlier from motion: what is measured there counts less."""
+    missing = np.concatenate([[0], np.cumsum(~usable)])
+    alone = missing[motions.j] > missing[motions.i]
+    return replace(motions, whiten=motions.whiten / np.where(alone, UNCHECKED, 1.0)[:, None, None])
+
+
+def _blind(motions: ScaledMotions, t: Array) -> NDArray[np.bool_]:
+    """(M-1,) intervals over which the IMU alone would have to carry the position, and cannot."""
+    crossed = np.zeros(len(t))
+    np.add.at(crossed, motions.i, 1.0)
+    np.add.at(crossed, motions.j, -1.0)
+    return np.asarray((np.diff(t) > CARRIED_S) & (np.cumsum(crossed)[:-1] == 0))
 
 
 def _hole_inflation(pieces: ImuPieces, imu_t_s: Array) -> Array:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import resource
 import sys
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -16,7 +17,8 @@ from fusion.ekf import ekf_estimate
 from fusion.estimate import Estimate, motions_estimate
 from fusion.graph_estimator import GraphEstimator
 from fusion.initialization import level_rotation
-from fusion.problem import Problem, build_problem
+from fusion.prepare import prepare
+from fusion.problem import Problem
 from fusion.result import Estimator, ImuConclusion, Refinement, View
 from fusion.stages import Stages
 from vio import se3
@@ -53,10 +55,11 @@ def refine(recording: Recording, motions: RelativeMotions, config: RefineConfig 
     config = config or RefineConfig()
     stages = Stages(announce)
     with stages("checks"):
-        problem = build_problem(recording, motions)
+        recording, problem, camera_imu = prepare(recording, motions)
     checkpoint = None if resume is None else Checkpoint(resume, refinement_key(recording, motions, config))
     estimate, estimator, reason = _first_that_works(problem, motions, config, stages, checkpoint)
-    return conclude(recording, motions, problem, estimate, estimator, reason, stages)
+    refined = conclude(recording, motions, problem, estimate, estimator, reason, stages)
+    return replace(refined, camera_imu=camera_imu)
 
 
 def _first_that_works(problem: Problem, motions: RelativeMotions, config: RefineConfig, stages: Stages,
@@ -111,6 +114,7 @@ def conclude(recording: Recording, motions: RelativeMotions, problem: Problem, e
         trajectory=Trajectory(times, estimate.T_world_body, estimate.cov), velocity_m_s=estimate.velocity_m_s,
         gyro_bias_rad_s=estimate.gyro_bias_rad_s, accel_bias_m_s2=estimate.accel_bias_m_s2,
         log_scale=estimate.log_scale, log_scale_sd=estimate.log_scale_sd, motions_only=only, scale=estimate.scale,
+        motion_noise=(problem.motion_noise[0], problem.motion_noise[1] * estimate.translation_noise),
         imu=ImuConclusion(estimate.imu_chi2_per_dof, estimate.imu_inflation, problem.gaps),
         motions_used=len(motions) - len(estimate.rejected), rejected=estimate.rejected, bridged=bridged,
         time_offset_s=recording.calibration.time_offset_s, truth=_truth(recording, times),

@@ -8,6 +8,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from fusion.camera_imu import UNKNOWN, CameraImu
 from fusion.joint import JointSamples
 from vio.camera import Camera
 from vio.errors import RecordingError
@@ -33,6 +34,8 @@ class ScaleConclusion:
     log_sd: float
     """Standard deviation of that mean as claimed; the prior's where scale was not estimated."""
     reason: str
+    assumed_sd: float = field(default=0.0, compare=False)
+    """Part of `log_sd` that no equation holds: assumed, common to the whole recording."""
 
 
 @dataclass(frozen=True)
@@ -113,6 +116,10 @@ class Refinement:
     peak_rss_bytes: int = 0
     joint: JointSamples | None = None
     """How the errors of all poses hang together; None where that could not be sampled."""
+    camera_imu: CameraImu = UNKNOWN
+    """How camera and IMU sit to each other, as measured, and what was done about it."""
+    motion_noise: tuple[float, float] = (1.0, 1.0)
+    """Factors by which the motions' claimed noise of rotation and translation was corrected; 1 where it was kept."""
     view: View | None = None
     """How the frames looked at the world; None when unknown."""
     inertial: InertialLevels | None = None

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from fusion.camera_imu import UNKNOWN, CameraImu, read_camera_imu
 from fusion.joint import JointSamples
 from fusion.result import ImuConclusion, OnlineConclusion, Refinement, ScaleConclusion, View
 from vio import se3
@@ -96,6 +97,8 @@ def _refinement(folder: Path, summary: dict[str, Any], motions_only: Trajectory,
             imu=ImuConclusion(imu["chi2_per_dof"], float(imu["inflation"]), gaps), motions_used=int(motions["used"]),
             rejected=np.asarray(arrays["rejected"], np.int64), bridged=int(motions.get("bridged", 0)),
             time_offset_s=float(summary["time_offset_s"]), truth=read_tum(truth) if truth.is_file() else None,
+            camera_imu=_camera_imu(summary), motion_noise=(float(motions.get("rotation_noise", 1.0)),
+                                                           float(motions.get("translation_noise", 1.0))),
             timing_s=dict(summary["timing_s"]), peak_rss_bytes=int(summary["peak_rss_bytes"]), joint=joint, view=view,
             inertial=inertial,
             online=None if filtered is None else OnlineConclusion(
@@ -105,6 +108,12 @@ def _refinement(folder: Path, summary: dict[str, Any], motions_only: Trajectory,
         raise FormatError(f"{folder.name}: summary.json or trajectory.npz lacks {error}; {AGAIN}") from None
     except (TypeError, ValueError) as error:
         raise FormatError(f"{folder.name}/summary.json: not as a run writes it ({error}); {AGAIN}") from None
+
+
+def _camera_imu(summary: dict[str, Any]) -> CameraImu:
+    """Folders of earlier versions hold none."""
+    values = summary.get("camera_imu")
+    return UNKNOWN if values is None else read_camera_imu(values, float(summary["motions"]["rotation_noise"]))
 
 
 def _load(path: Path, name: str) -> dict[str, Any]:

@@ -134,7 +134,12 @@ def _fortran(blocks: Array) -> Array:
     return np.swapaxes(np.ascontiguousarray(np.swapaxes(blocks, 1, 2)), 1, 2)
 
 
-def _step(gaussian: gtsam.GaussianFactorGraph, ordering: gtsam.Ordering) -> gtsam.VectorValues:
+def linear_step(gaussian: gtsam.GaussianFactorGraph, ordering: gtsam.Ordering) -> gtsam.VectorValues:
+    """Solve a linear graph by Cholesky, or by QR where that fails.
+
+    Raises:
+        EstimationError: the system has no unique solution.
+    """
     try:
         return gaussian.optimize(ordering)
     except RuntimeError:  # indeterminate under Cholesky: gtsam has no class of its own for it
@@ -166,7 +171,7 @@ def gauss_newton(native: gtsam.NonlinearFactorGraph, values: gtsam.Values, term:
         gaussian = linear_graph(native, values, term)
         if ordering is None:
             ordering = gtsam.Ordering.MetisGaussianFactorGraph(gaussian)  # the structure never changes
-        delta = _step(gaussian, ordering)
+        delta = linear_step(gaussian, ordering)
         values, new_cost, moved = _line_search(native, term, values, delta, cost)
         iterations += 1
         converged = cost - new_cost <= relative_tolerance * cost

@@ -7,23 +7,18 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from vio import se3
 from vio.errors import ImuError
 from vio.imu import Gap, ImuNoise, ImuSamples, find_gaps
+from vio.imu_axes import AXES, check_axes, check_dead_axes, lost_direction, turned_windows
 
 Array = NDArray[np.float64]
 
-AXES = ("gyro x", "gyro y", "gyro z", "accelerometer x", "accelerometer y", "accelerometer z")
 STANDARD_G = 9.80665
 GRAVITY_RANGE_M_S2 = (7.5, 12.5)
 ACCEL_UNITS = (("g", (0.75, 1.3), STANDARD_G), ("mg", (750.0, 1300.0), 1e-3 * STANDARD_G))
 GYRO_PEAK_RAD_S = 35.0
 """2000 deg/s, the full scale of common gyros."""
 
-WINDOW_S = 5.0
-SHORTEST_WINDOW_S = 1.0
-MAX_WINDOWS = 100
-TURNED_RAD = 0.3
 LOST_DIRECTION = 0.25  # mean directions of force this much shorter than 1 would take linear accelerations near 1 g
 UNIT_RATIO = 3.0
 
@@ -56,17 +51,19 @@ def check_imu(samples: ImuSamples, noise: ImuNoise) -> ImuReport:
 
     Raises:
         ImuError: fewer than two samples, wrong shapes, a value that is not finite, stamps that do not increase, no
-            gravity in the accelerometer (or in other units), a gyro in deg/s, an axis at full scale for more than
-            5 % of the samples; each with row, time, limit and remedy.
+            gravity in the accelerometer (or in other units), a gyro in deg/s, an axis that is dead, swapped or
+            reversed, an axis at full scale for more than 5 % of the samples; each with row, time, limit and remedy.
     """
     t_s = _check_stamps(samples)
     _check_finite(samples, t_s)
+    check_dead_axes(samples)
     gravity_m_s2 = _check_gravity(samples)
     _check_gyro_unit(samples, t_s)
     rate_hz = 1.0 / float(np.median(np.diff(t_s)))
     gaps = tuple(find_gaps(t_s))
     saturated = find_saturation(samples, noise)
     _check_saturation(saturated, len(samples))
+    check_axes(samples, t_s)
     return ImuReport(rate_hz, gaps, gravity_m_s2, saturated, _warnings(samples, noise, rate_hz, gaps, saturated))
 
 
@@ -163,44 +160,12 @@ def _check_gyro_unit(samples: ImuSamples, t_s: Array) -> None:
 
 
 def _in_degrees(samples: ImuSamples, t_s: Array) -> bool:
-    windows = _windows(t_s)
-    if len(windows) == 0:
+    windows = turned_windows(samples, t_s)
+    if len(windows.turns_rad) == 0:
         return False
-    step_s = np.diff(t_s[windows], axis=1)[..., None]
-    gyro = samples.gyro_rad_s[windows]
-    turns = 0.5 * (gyro[:, 1:] + gyro[:, :-1]) * step_s
-    turned = np.linalg.norm(np.cumsum(turns, axis=1), axis=2).max(axis=1) > TURNED_RAD
-    if not turned.any():
-        return False
-    force = samples.accel_m_s2[windows][turned]
-    as_rad = _lost_direction(turns[turned], force)
-    as_deg = _lost_direction(np.deg2rad(turns[turned]), force)
+    as_rad = lost_direction(windows.turns_rad, windows.force_m_s2)
+    as_deg = lost_direction(np.deg2rad(windows.turns_rad), windows.force_m_s2)
     return as_rad > LOST_DIRECTION and as_rad > UNIT_RATIO**2 * as_deg
-
-
-def _windows(t_s: Array) -> NDArray[np.int64]:
-    """Sample indices (W, L) of windows of about 5 s without gaps, at most 100, spread over the recording."""
-    steps = np.diff(t_s)
-    span = min(WINDOW_S, float(t_s[-1]))
-    length = int(span / np.median(steps)) + 1
-    if span < SHORTEST_WINDOW_S or length < 3 or length > len(t_s):
-        return np.zeros((0, 0), np.int64)
-    starts = np.unique(np.linspace(0, len(t_s) - length, min(MAX_WINDOWS, len(t_s) // length)).astype(np.int64))
-    windows = starts[:, None] + np.arange(length)
-    whole = t_s[windows[:, -1]] - t_s[windows[:, 0]] < 1.5 * span
-    return np.asarray(windows[whole])
-
-
-def _lost_direction(turns: Array, force: Array) -> float:
-    """Median over W windows of 1 - |mean direction| of forces (W, L, 3), turned back by vectors (W, L-1, 3) [rad]."""
-    direction = force / np.maximum(np.linalg.norm(force, axis=2, keepdims=True), 1e-9)
-    steps = se3.so3_exp(turns)
-    R = np.broadcast_to(np.eye(3), (len(force), 3, 3))
-    total = direction[:, 0].copy()
-    for k in range(steps.shape[1]):
-        R = R @ steps[:, k]
-        total += (R @ direction[:, k + 1, :, None])[..., 0]
-    return float(np.median(1 - np.linalg.norm(total, axis=1) / force.shape[1]))
 
 
 def _clipped(axis: Array, smallest_full_scale: float) -> NDArray[np.bool_]:

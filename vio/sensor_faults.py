@@ -126,6 +126,32 @@ def with_bias_step(samples: ImuSamples, at_s: float, gyro_rad_s: ArrayLike = (0.
     return ImuSamples(samples.t_ns, samples.gyro_rad_s + later * gyro, samples.accel_m_s2 + later * accel)
 
 
+def with_bias_drift(samples: ImuSamples, gyro_rad_s: ArrayLike = (0.0, 0.0, 0.0),
+                    accel_m_s2: ArrayLike = (0.0, 0.0, 0.0), time_constant_s: float = 600.0) -> ImuSamples:
+    """The stream of a sensor that warms up: biases that grow as 1 - exp(-t / time constant) to a final (3,) each.
+
+    Raises:
+        CorruptionError: a final bias that is not three finite numbers, or a time constant that is not positive.
+    """
+    _check(np.isfinite(time_constant_s) and time_constant_s > 0, "bias drift",
+           f"time constant is {time_constant_s} s, must be positive")
+    final = with_bias_step(samples, 0.0, gyro_rad_s, accel_m_s2)
+    share = (1 - np.exp(-_seconds(samples) / time_constant_s))[:, None]
+    return ImuSamples(samples.t_ns, samples.gyro_rad_s + share * (final.gyro_rad_s - samples.gyro_rad_s),
+                      samples.accel_m_s2 + share * (final.accel_m_s2 - samples.accel_m_s2))
+
+
+def with_clock_jump(samples: ImuSamples, at_s: float, jump_s: float) -> ImuSamples:
+    """The stream of a clock that jumps: stamps from `at_s` on are later by `jump_s` (negative: earlier).
+
+    Raises:
+        CorruptionError: a jump that is not finite.
+    """
+    _check(np.isfinite(jump_s), "clock jump", f"{jump_s} s; give a finite number")
+    later = _seconds(samples) >= at_s
+    return replace(samples, t_ns=samples.t_ns + later * np.int64(round(jump_s / NS)))
+
+
 def without_frames(recording: Recording, kept: ArrayLike) -> Recording:
     """The recording with only those frames (N,) that `kept` marks; IMU and truth stay whole.
 

@@ -130,6 +130,7 @@ def sentences(
                          f"{length(math.exp(scale.log_mean))} {spread(scale.log_sd)} (1 sd). "
                          f"Why: {_ended(scale.reason)}"))
     out.append(("IMU", _imu(refinement)))
+    out.append(("Camera and IMU", _camera_imu(refinement)))
     out.append(("Motions", _motions(refinement)))
     if within_3_sigma is not None:
         out.append(("Certainty", f"{100 * within_3_sigma:.1f} % of the positions lie inside their claimed 3-sigma "
@@ -149,11 +150,24 @@ def _imu(refinement: Refinement) -> str:
                      "scale held (about 0.5 when all is well).")
     if imu.inflation != 1:
         parts.append(f"Their accelerometer noise was inflated {imu.inflation:g}-fold.")
+    biases = (f"{1e3 * math.hypot(*refinement.accel_bias_m_s2.mean(axis=0)):.0f} mm/s² and "
+              f"{angle(math.hypot(*refinement.gyro_bias_rad_s.mean(axis=0)))} per second")
+    parts.append(f"Mean biases of accelerometer and gyro: {biases}.")
     if imu.gaps:
         parts.append(f"{_count(len(imu.gaps), 'hole')} of more than 0.5 s, where only the motions hold the frames.")
     if refinement.time_offset_s:
         parts.append(f"Camera-IMU time offset applied: {1e3 * refinement.time_offset_s:.3g} ms.")
-    return " ".join(parts) or "No holes; camera and IMU on one clock."
+    return " ".join(parts)
+
+
+def _camera_imu(refinement: Refinement) -> str:
+    found = refinement.camera_imu
+    if not found.pairs:
+        return f"Their calibration was not checked: {_ended(found.reason)}"
+    turn, sd = math.hypot(*found.rotation_rad), max(found.rotation_sd_rad)
+    return (f"The gyro's turns against the motions' put the camera {angle(turn)} (sd {angle(sd)} per axis) off the "
+            f"calibration and the IMU's clock {1e3 * found.time_offset_s:+.1f} ms (sd "
+            f"{1e3 * found.time_offset_sd_s:.1f} ms): {_ended(found.reason)}")
 
 
 def _motions(refinement: Refinement) -> str:
@@ -165,6 +179,10 @@ def _motions(refinement: Refinement) -> str:
     if refinement.bridged:
         text += (f". {_count(refinement.bridged, 'frame pair')} measured by no motion: "
                  "there, “motions alone” stands still")
+    factors = [f"{what} {factor:.2g}-fold" for what, factor in
+               zip(("rotation", "translation"), refinement.motion_noise, strict=True) if factor != 1]
+    if factors:
+        text += f". Their claimed noise contradicts the data and was corrected: {' and '.join(factors)}"
     return text + "."
 
 

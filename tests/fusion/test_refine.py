@@ -11,8 +11,9 @@ from vio import se3
 from vio.consistency import coverage, fix_gauge, nees
 from vio.errors import EstimationError
 from vio.metrics import ate
+from vio.motion_sources import merge_motions
 from vio.motions import RelativeMotions
-from vio.simulation import T_BODY_CAMERA
+from vio.simulation import T_BODY_CAMERA, network_like_motions
 
 # Held out: no threshold of fusion was chosen on these seeds.
 HELD_OUT = [("small-bowel", "gaussian", 3, 301), ("colon", "collision", 3, 302), ("stomach", "peristalsis", 4, 303),
@@ -315,26 +316,15 @@ def test_a_vague_prior_is_searched(examination, off, sd):
     assert gain(refined) < 0.3
 
 
-# ---- a body that moves in ways the camera does not see ---------------------------------------
-
-@pytest.fixture(scope="module")
-def living(examine):
-    return examine("small-bowel", "gaussian", 2, 100.0, 202)
-
-
-@pytest.mark.parametrize(("amplitude_m", "frequency_hz"), [(0.005, 0.25), (0.001, 1.0)], ids=["breathing", "shifting"])
-def test_breathing_takes_the_scale_from_the_imu(living, amplitude_m, frequency_hz):
-    refined = refine(living.shaken_unseen(amplitude_m, frequency_hz), living.motions)
-    assert refined.estimator == "graph"
-    assert refined.scale.policy in ("prior", "fixed") and refined.imu.inflation > 1
-    assert "accelerometer noise ×" in refined.scale.reason
-    assert gain(refined) < 0.95
-
-
-def test_walking_leaves_only_the_direction_of_gravity(living):
-    """20 mm at 1.7 Hz: more than 2 m/s² that no motion confirms."""
-    refined = refine(living.shaken_unseen(0.02, 1.7), living.motions)
-    assert refined.scale.policy == "fixed" and refined.scale.log_mean == living.motions.scale_log_mean
-    assert refined.fallback_reason or refined.imu.inflation > 50
-    assert gain(refined) < 1.2
-    assert np.nanmean(nees(refined.trajectory, refined.truth)) < 4
+def test_two_sources_beat_either_and_one_given_twice_gains_nothing(examination, refined):
+    """A second network with noise of its own, in a unit of its own."""
+    truth = examination.recording.truth_at_frames()
+    other = network_like_motions(truth, T_BODY_CAMERA, 77, scale_log_mean=np.log(2.0)).motions
+    merged = merge_motions([examination.motions, other])
+    both = refine(examination.recording, merged.motions)
+    alone = refine(examination.recording, other)
+    assert merged.correlation[0, 1] < 0.15
+    sd = [np.sqrt(r.trajectory.cov[-1, 3:, 3:].trace()) for r in (both, refined, alone)]
+    assert sd[0] < 0.9 * min(sd[1:]) and np.nanmean(nees(both.trajectory, both.truth)) < 3
+    twice = refine(examination.recording, merge_motions([examination.motions] * 2).motions)
+    assert np.sqrt(twice.trajectory.cov[-1, 3:, 3:].trace()) == pytest.approx(sd[1], rel=0.1)

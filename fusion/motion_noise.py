@@ -1,0 +1,100 @@
+"""Whether the motions' claimed translation noise is right: its variance component, estimated from a solved graph.
+
+With whitened residuals r and redundancy 3 n - tr(P) of the n accepted motions' translations, the claimed noise is wrong
+by the factor sqrt(rᵀr / redundancy) (Förstner, Zeitschrift für Vermessungswesen 104, 1979). P, the part of the errors
+that the estimate follows, is as large as the graph; its trace is that of random probes z: E[zᵀPz] = tr(P) (Hutchinson,
+Comm. Stat. Sim. 18, 1989). One probe costs one linear solve.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fusion.engine import Begin, Engine
+from fusion.graph import read_poses
+from fusion.scaled_motion import Linearized, ScaledMotions, linearize
+from fusion.solve import MotionTerm
+
+Array = NDArray[np.float64]
+
+PROBED_MOTIONS = 4000
+"""Motions times probes: the factor is then known to a few percent."""
+LEAST_REDUNDANCY = 30.0
+"""Below, the data do not tell the motions' noise from the capsule's motion."""
+LEAST_MOTIONS = 50
+LARGEST = 10.0
+"""Factor, up or down, beyond which it is no longer a noise card that is wrong."""
+ONCE = 0.9
+RIGHT = (0.8, 1.25)
+"""Factors that are left alone."""
+
+
+def is_right(factor: float) -> bool:
+    """Whether claimed noise that is wrong by this factor may stay."""
+    return RIGHT[0] <= factor <= RIGHT[1]
+
+
+def measured_once(motions: ScaledMotions) -> bool:
+    """Whether hardly a pair of frames was measured twice.
+
+    Sources that share errors are closer to each other than to the truth, and carry covariances widened for it: their
+    residuals would make the noise look smaller than it is.
+    """
+    pairs = np.unique(np.column_stack([motions.i, motions.j]), axis=0)
+    return len(pairs) > ONCE * len(motions)
+
+
+def bounded(factor: float) -> float:
+    """A factor that a noise card can be wrong by."""
+    return float(np.clip(factor, 1 / LARGEST, LARGEST))
+
+
+def with_noise(motions: ScaledMotions, rotation: float, translation: float) -> ScaledMotions:
+    """The motions with their noise multiplied: standard deviations of rotation and translation."""
+    return replace(motions, whiten=motions.whiten / np.repeat([rotation, translation], 3))
+
+
+def translation_noise(engine: Engine, begin: Begin, term: MotionTerm, rng: np.random.Generator) -> float:
+    """Real over claimed standard deviation of the translations; 1 where the data do not tell.
+
+    Args:
+        engine: that solved the graph.
+        begin: all other factors, and the common solution.
+        term: the motions as they were solved; those with weight below 1 are left out.
+        rng: source of the probes.
+
+    Raises:
+        EstimationError: the linear system has no unique solution.
+    """
+    accepted = term.weight == 1.0
+    if accepted.sum() < LEAST_MOTIONS or not measured_once(term.motions):
+        return 1.0
+    still = engine.step(begin, term)
+    blocks = linearize(term.motions, *read_poses(begin.values), term.log_scale(begin.values))
+    residual2 = float((blocks.b[accepted, 3:] ** 2).sum())
+    probes = max(1, round(PROBED_MOTIONS / len(term.motions)))
+    followed = 0.0
+    for _ in range(probes):
+        z = rng.standard_normal((len(term.motions), 3)) * accepted[:, None]
+        moved = engine.step(begin, _shifted(term, z))
+        response = _response(blocks, term.motions, moved.pose - still.pose, moved.scale - still.scale)
+        followed += float((z * response)[accepted].sum()) / probes
+    redundancy = 3 * int(accepted.sum()) - followed
+    return bounded(np.sqrt(residual2 / redundancy)) if redundancy > LEAST_REDUNDANCY else 1.0
+
+
+def _shifted(term: MotionTerm, z: Array) -> MotionTerm:
+    """The term whose measured translations are larger by whitened amounts z (N, 3); Jacobians stay as they are."""
+    motions = term.motions
+    error = np.linalg.solve(motions.whiten[:, 3:, 3:], z[:, :, None])
+    return replace(term, motions=replace(motions, t=motions.t + (motions.R @ error)[:, :, 0]))
+
+
+def _response(blocks: Linearized, motions: ScaledMotions, pose: Array, scale: Array) -> Array:
+    """(N, 3) change of the predicted whitened translations under changes (M, 6) of poses and (N,) of log scales."""
+    A_i, A_j, A_s = (A[:, 3:] for A in (blocks.A_i, blocks.A_j, blocks.A_s))
+    change = (A_i @ pose[motions.i][:, :, None] + A_j @ pose[motions.j][:, :, None])[:, :, 0]
+    return np.asarray(change + A_s[:, :, 0] * scale[:, None])
