@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 import os
+from dataclasses import replace
 from pathlib import Path
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")
@@ -17,12 +18,15 @@ mpl.use("Agg")
 import matplotlib.pyplot as plt
 import numpy as np
 
-from fusion import refine
+from fusion import Refinement, refine
 from vio import se3
 from vio.metrics import ate, fix_gauge
+from vio.recording import Recording
 from vio.simulation import network_like_motions, simulate_recording
 
-FRAMES, SEED = 86_400, 831
+FRAMES, SEED = 86_400, 801
+PRIOR_OFF = 0.223
+"""How far the mean of the scale prior is off in log, and its standard deviation."""
 PICTURE = Path(__file__).resolve().parents[1] / "docs" / "images" / "examination.png"
 
 
@@ -32,7 +36,14 @@ def main() -> None:
     truth = recording.truth_at_frames()
     network = network_like_motions(truth, recording.calibration.T_body_camera, SEED,
                                    scale_walk_per_sqrt_1000_frames=0.02)
-    refined = refine(recording, network.motions)
+    motions = replace(network.motions, scale_log_mean=network.motions.scale_log_mean + PRIOR_OFF,
+                      scale_log_sd=PRIOR_OFF)
+    draw(recording, refine(recording, motions))
+
+
+def draw(recording: Recording, refined: Refinement) -> None:
+    """Error and claim above, the motions alone beside it below."""
+    truth = recording.truth_at_frames()
     moved = fix_gauge(refined.trajectory, truth)
     xi = se3.log(se3.inverse(refined.trajectory.T_world_body) @ moved.T_world_body)
     sd = np.sqrt(np.trace(refined.trajectory.cov[:, 3:, 3:], axis1=1, axis2=2))
