@@ -10,6 +10,7 @@ import base64
 import fcntl
 import json
 import os
+import select
 import shutil
 import subprocess
 import tempfile
@@ -53,15 +54,17 @@ class Browser:
         os.write(self.writing, json.dumps(message).encode() + b"\0")
         end = time.monotonic() + self.patience_s
         while time.monotonic() < end:
-            answer = self._receive()
+            answer = self._receive(end)
             if answer.get("id") == self.number:
                 if "error" in answer:
                     raise RuntimeError(f"{method}: {answer['error']['message']}")
                 return dict(answer["result"])
         raise TimeoutError(f"chromium did not answer {method} within {self.patience_s:g} s")
 
-    def _receive(self) -> dict[str, Any]:
+    def _receive(self, end: float) -> dict[str, Any]:
         while b"\0" not in self.buffer:
+            if not select.select([self.reading], [], [], max(0.0, end - time.monotonic()))[0]:
+                return {}
             part = os.read(self.reading, 1 << 20)
             if not part:
                 raise RuntimeError("chromium went away")
@@ -122,7 +125,7 @@ def _pipe() -> tuple[int, int]:
 
 
 @contextmanager
-def browser(patience_s: float = 60.0) -> Iterator[Browser]:
+def browser(patience_s: float = 120.0) -> Iterator[Browser]:
     """A headless Chromium; raises FileNotFoundError where none is installed."""
     program = find_chromium()
     if program is None:
