@@ -62,7 +62,7 @@ def inertial_steps(problem: Problem, accel_inflation: float = 1.0) -> InertialSt
     np.add.at(spanned, problem.motions.j, -1)
     measured = np.cumsum(spanned)[:-2] > 0
     for k in gap:
-        dt, carried = steps.dt_s[k], not measured[k] and gyro_covers(problem, k)
+        dt, carried = steps.dt_s[k], not measured[k] and gyro_covers(problem, int(k))
         if not carried:
             steps.R[k] = np.eye(3)
         for values in (steps.v, steps.p, steps.R_bg, steps.v_bg, steps.v_ba, steps.p_bg, steps.p_ba):
