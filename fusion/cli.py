@@ -1,5 +1,5 @@
 """The command line: `capsule-vio demo | doctor | simulate | convert | inspect | train | evaluate | predict | refine |
-compare | locate | report`.
+compare | locate | report | benchmark`.
 
 Exit codes: 0 done; 2 wrong usage; 3 the input cannot be used; 4 no estimator produced a trajectory;
 1 a bug (traceback). Heavy libraries load only in the command that needs them.
@@ -26,7 +26,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     commands: dict[str, Callable[[argparse.Namespace], int]] = {
         "demo": _demo, "doctor": _doctor, "simulate": _simulate, "convert": _convert, "inspect": _inspect,
         "train": _train, "evaluate": _evaluate, "predict": _predict, "refine": _refine, "compare": _compare,
-        "locate": _locate, "report": _report,
+        "locate": _locate, "report": _report, "benchmark": _benchmark,
     }
     try:
         return commands[arguments.command](arguments)
@@ -309,6 +309,19 @@ def _report(arguments: argparse.Namespace) -> int:
     refinement, summary = read_refinement(arguments.run), read_run(arguments.run).summary
     write_report(refinement, summary, arguments.run / "report.html", lesions=read_lesions(arguments.run))
     print(arguments.run / "report.html")
+    return 0
+
+
+def _benchmark(arguments: argparse.Namespace) -> int:
+    from learned.benchmark.command import run_table, summary
+
+    with _Progress() as progress:
+        result = run_table(arguments.table, arguments.data, arguments.budget, arguments.out, seeds=arguments.seeds,
+                           method=arguments.method, device=arguments.device, progress=progress)
+    if arguments.json:
+        _print_json(result)
+    else:
+        print(summary(result, arguments.out))
     return 0
 
 

@@ -16,6 +16,8 @@ CAMERAS = ("mirocam", "fisheye-140", "fisheye-156", "pinhole-110")
 PRODUCTS = ("normals", "albedo", "mask", "flow")
 DATASETS = ("mm-wce",)
 METHODS = ("gyro-correlation", "endosfmlearner", "af-sfmlearner", "ra-depth", "endodac")
+TABLES = ("methods", "intensity", "vibration-types", "fusion", "corruptions")
+BUDGETS = ("smoke", "short", "full")
 FUSIONS = ("fourier", "concatenation", "summation", "gated", "aff", "iaff", "butd")
 
 
@@ -28,7 +30,7 @@ def build_parser() -> argparse.ArgumentParser:
     parser.add_argument("--version", action="version", version=f"%(prog)s {_version()}")
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
     for add in (_demo, _doctor, _simulate, _convert, _inspect, _train, _evaluate, _predict, _refine, _compare, _locate,
-                _report):
+                _report, _benchmark):
         add(commands)
     return parser
 
@@ -200,3 +202,19 @@ def _report(commands: Commands) -> None:
     parser = _command(commands, "report", "write a run's report.html again, with the lesions that locate placed",
                       "report RUN")
     parser.add_argument("run", type=Path, metavar="RUN", help="run folder that refine wrote")
+
+
+def _benchmark(commands: Commands) -> None:
+    parser = _command(commands, "benchmark", "measure one of the paper's tables; goes on where it was stopped "
+                      "(docs/benchmarks.md)", "benchmark fusion --data DATA --budget smoke --out OUT")
+    parser.add_argument("table", choices=TABLES)
+    parser.add_argument("--data", type=Path, required=True, metavar="DATA",
+                        help="what `simulate --dataset mm-wce --out DATA` wrote")
+    parser.add_argument("--budget", choices=BUDGETS, required=True,
+                        help="smoke: minutes, shows that it works; short: hours; full: the paper's, for GPUs")
+    parser.add_argument("--seeds", type=int, metavar="N", help="trainings per variant (default: the budget's)")
+    parser.add_argument("--method", choices=METHODS, default="af-sfmlearner",
+                        help="of all tables but `methods` (default: the paper's, af-sfmlearner)")
+    parser.add_argument("--device", choices=("cpu", "cuda"), help="default: cuda where there is one")
+    parser.add_argument("--out", type=Path, required=True, metavar="OUT")
+    _json(parser)
