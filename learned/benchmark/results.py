@@ -23,6 +23,8 @@ Parts: TypeAlias = Mapping[tuple[Variant, int], Mapping[str, dict[str, Any]]]
 
 SCHEMA = 1
 GUESS = "no network: constant depth, rest"
+GUESSES = {"abs_rel": "the same depth everywhere", "ate_paper_mm": "a guess of rest"}
+"""What variants have to beat, by metric."""
 
 
 def table_of(plan: TablePlan, budget: Budget, data: DataSet, runs: list[Run], parts: Parts) -> dict[str, Any]:
@@ -39,7 +41,8 @@ def table_of(plan: TablePlan, budget: Budget, data: DataSet, runs: list[Run], pa
     comparisons = [_comparison(plan, comparison, parts, seeds) for comparison in plan.comparisons]
     return {"schema": SCHEMA, "table": plan.name, "title": plan.title, "paper": plan.paper,
             "lines": [_line(line, parts, seeds) for line in plan.lines],
-            "guesses": _guesses(plan, parts), "comparisons": comparisons, "verdicts": verdicts(comparisons),
+            "guesses": _guesses(plan, parts), "comparisons": comparisons,
+            "verdicts": [*verdicts(comparisons, budget.seeds), *_learned_anything(plan, parts, seeds)],
             "metrics": {m.key: {"label": m.label, "alignment": m.alignment, "higher_is_better": m.higher_is_better}
                         for m in METRICS},
             "manifest": _manifest(budget, data, runs, parts)}
@@ -80,11 +83,15 @@ def _guesses(plan: TablePlan, parts: Parts) -> list[dict[str, Any]]:
         where = (line.variant.sets, line.variant.level)
         if where in found or CLEAN.name not in line.conditions:
             continue
-        per_sequence = parts[line.variant, 0][CLEAN.name]["guess"].values()
-        means = {m.key: _mean(np.array([scores[m.key] for scores in per_sequence], float)) for m in METRICS}
         level = "" if line.variant.level is None else f", level {line.variant.level}"
-        found[where] = {"row": f"{', '.join(line.variant.sets)}{level}", "side": GUESS, "means": means}
+        found[where] = {"row": f"{', '.join(line.variant.sets)}{level}", "side": GUESS,
+                        "means": _guess(line.variant, parts)}
     return list(found.values())
+
+
+def _guess(variant: Variant, parts: Parts) -> dict[str, float | None]:
+    per_sequence = parts[variant, 0][CLEAN.name]["guess"].values()
+    return {m.key: _mean(np.array([scores[m.key] for scores in per_sequence], float)) for m in METRICS}
 
 
 def _comparison(plan: TablePlan, comparison: Comparison, parts: Parts, seeds: list[int]) -> dict[str, Any]:
@@ -108,18 +115,17 @@ def verdict(metric: Metric, found: Difference, baseline: str, candidate: str) ->
     if found.mean == 0:
         return f"{metric.label}: no difference at all"
     wins = (found.mean > 0) == metric.higher_is_better
-    text = (f"{metric.label}: {candidate if wins else baseline} is better by "
-            f"{abs(found.mean):.{metric.digits}f}")
+    text = f"{metric.label}: {candidate if wins else baseline} is better by {abs(found.mean):.3g}"
     if found.low is None or found.high is None:
         return (f"{text}; {found.sequences} sequence{'s are' if found.sequences > 1 else ' is'} too few for an "
                 f"interval (at least {FEWEST_SEQUENCES})")
-    interval = f"{found.low:+.{metric.digits}f} to {found.high:+.{metric.digits}f}"
+    interval = f"{found.low:+.3g} to {found.high:+.3g}"
     says = "excludes 0" if found.excludes_zero else "includes 0, so these data do not tell the two apart"
     return f"{text}; the 95 % interval of the difference, {interval}, {says}"
 
 
-def verdicts(comparisons: list[dict[str, Any]]) -> list[str]:
-    """One sentence per headline metric over all comparisons of a table."""
+def verdicts(comparisons: list[dict[str, Any]], seeds: int) -> list[str]:
+    """One sentence per headline metric over all comparisons of a table, and what the intervals leave out."""
     sentences = []
     for metric in (m for m in METRICS if m.key in HEADLINES):
         found = [c["differences"][metric.key] for c in comparisons if c["differences"][metric.key] is not None]
@@ -129,6 +135,22 @@ def verdicts(comparisons: list[dict[str, Any]]) -> list[str]:
         sentences.append(f"{metric.label}: with vibration better in {len(better)} of {len(found)} comparisons "
                          f"(interval excludes 0 in {_sure(better)}), {VISION} better in {len(worse)} (in "
                          f"{_sure(worse)}).")
+    if seeds == 1:
+        sentences.append("One seed: the intervals speak of other test sequences, not of other trainings, which may "
+                         "differ by more.")
+    return sentences
+
+
+def _learned_anything(plan: TablePlan, parts: Parts, seeds: list[int]) -> list[str]:
+    """How many lines beat what needs no network; where few do, the comparison is one of networks that know nothing."""
+    lines = [line for line in plan.lines if line.conditions == (CLEAN.name,)]
+    sentences = []
+    for metric, what in ((m, GUESSES[m.key]) for m in METRICS if m.key in GUESSES):
+        better = 0
+        for line in lines:
+            mean, guessed = (_mean(cells(line, metric.key, parts, seeds)), _guess(line.variant, parts)[metric.key])
+            better += mean is not None and guessed is not None and mean < guessed
+        sentences.append(f"{metric.label}: {better} of {len(lines)} variants beat {what}.")
     return sentences
 
 
