@@ -166,4 +166,5 @@ def _manifest(budget: Budget, data: DataSet, runs: list[Run], parts: Parts) -> d
             "versions": [dict(found) for found in sorted({tuple(part["versions"].items()) for part in every}, key=str)],
             "data": {"simulator_version": data.simulator_version, "sha256": dict(sorted(used.items()))},
             "steps": {run.name: next(iter(parts[run.variant, run.seed].values()))["trained"]["steps"] for run in runs},
-            "bootstrap": {"draws": DRAWS, "coverage": COVERAGE, "kind": "percentile, seeds and sequences resampled"}}
+            "bootstrap": {"draws": DRAWS, "coverage": COVERAGE,
+                          "kind": "percentile, seeds and sequences resampled, stretched for few cells"}}

