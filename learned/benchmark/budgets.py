@@ -52,6 +52,7 @@ BUDGETS: dict[str, Budget] = {budget.name: budget for budget in (
 """By name. `full` is the paper's: Adam at 1e-4 (the default of the four), batch 4, 400 epochs."""
 VALIDATIONS, CHECKPOINTS = 10, 10
 """Per training."""
+FEWEST_STEPS_TO_VALIDATE = 20
 
 
 def budget_of(name: str, seeds: int | None = None) -> Budget:
@@ -90,7 +91,7 @@ def decisions(budget: Budget, method: str, fusion: str | None, seed: int, frames
     config = method_config(method, vibration=fusion is not None, fusion=strategy, width=budget.width, **options)
     steps = budget.steps if budget.steps is not None else _epochs(budget, frames)
     return train_config(config, steps=steps, batch_size=budget.batch_size, seed=seed,
-                        log_every=max(steps // 100, 1), validate_every=max(steps // VALIDATIONS, 1),
+                        log_every=max(steps // 100, 1), validate_every=max(steps // VALIDATIONS, FEWEST_STEPS_TO_VALIDATE),
                         checkpoint_every=max(steps // CHECKPOINTS, 1))
 
 

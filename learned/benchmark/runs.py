@@ -26,13 +26,15 @@ from learned.benchmark.scores import Scores, guess, mean_log_snr, scores
 from learned.benchmark.tables import Variant
 from learned.errors import BenchmarkError
 from learned.measured import measure
-from learned.train_config import TrainConfig, train_config_to_dict
+from learned.train_config import BOOKKEEPING, TrainConfig, train_config_to_dict
 from learned.training import CHECKPOINT, TrainedRun, train
 from learned.training_source import SourceSettings, TrainingSource
 from vio.atomic import atomic_write
 from vio.recording import Recording
 
 SCHEMA = 1
+INDIFFERENT = tuple(name for name in BOOKKEEPING if name not in ("steps", "patience"))
+"""Decisions of a training that its weights do not depend on."""
 LIBRARIES = ("capsule-vio", "torch", "numpy", "scipy", "opencv-python-headless")
 
 
@@ -112,7 +114,8 @@ def versions() -> dict[str, str | None]:
 
 def _decisions(run: Run, config: TrainConfig) -> dict[str, Any]:
     """All that decides a result, in values as JSON gives them back."""
-    content = {"training": train_config_to_dict(config), "train_frames": run.budget.train_frames,
+    training = {name: value for name, value in train_config_to_dict(config).items() if name not in INDIFFERENT}
+    content = {"training": training, "train_frames": run.budget.train_frames,
                "test_frames": run.budget.test_frames, "train_on": {e.path: e.sha256 for e in run.train_on},
                "judge_on": {e.path: e.sha256 for e in run.judge_on}}
     return dict(json.loads(json.dumps(content)))
