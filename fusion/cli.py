@@ -1,5 +1,5 @@
 """The command line: `capsule-vio demo | doctor | simulate | convert | inspect | train | evaluate | predict | refine |
-compare | locate | report | view`.
+compare | locate | report | view | benchmark`.
 
 Exit codes: 0 done; 2 wrong usage; 3 the input cannot be used; 4 no estimator produced a trajectory;
 1 a bug (traceback). Heavy libraries load only in the command that needs them.
@@ -8,13 +8,14 @@ Exit codes: 0 done; 2 wrong usage; 3 the input cannot be used; 4 no estimator pr
 from __future__ import annotations
 
 import argparse
-import json
 import sys
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
+from fusion import cli_learned
+from fusion.cli_output import print_json
 from fusion.cli_parser import build_parser
 from fusion.cli_progress import Progress
 from vio.errors import UsageError, VioError
@@ -29,8 +30,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     arguments = build_parser().parse_args(argv)
     commands: dict[str, Callable[[argparse.Namespace], int]] = {
         "demo": _demo, "doctor": _doctor, "simulate": _simulate, "convert": _convert, "inspect": _inspect,
-        "train": _train, "evaluate": _evaluate, "predict": _predict, "refine": _refine, "compare": _compare,
-        "locate": _locate, "report": _report, "view": _view,
+        "train": cli_learned.train, "evaluate": cli_learned.evaluate, "predict": cli_learned.predict,
+        "refine": _refine, "compare": _compare, "locate": _locate, "report": _report, "view": _view,
+        "benchmark": cli_learned.benchmark,
     }
     try:
         return commands[arguments.command](arguments)
@@ -47,21 +49,18 @@ def _one_line(error: VioError) -> str:
     return "".join(c if c.isprintable() or c == "\u00a0" else " " for c in str(error))
 
 
-def _print_json(value: Any) -> None:
-    print(json.dumps(value, indent=2, sort_keys=True, allow_nan=False))
-
-
 def _demo(arguments: argparse.Namespace) -> int:
+    import learned
     from fusion.compare_text import format_table
     from fusion.demo import run_demo
 
     with Progress() as progress:
-        demo = run_demo(arguments.out, arguments.seed, progress)
+        demo = run_demo(arguments.out, arguments.seed, learned.predict, progress)
     if arguments.json:
-        _print_json(demo.comparison.to_dict())
+        print_json(demo.comparison.to_dict() | {"rendered": demo.rendered.to_dict()})
         return 0
-    print(format_table(demo.comparison))
-    print(f"report: {demo.report}\nplot:   {demo.plot}")
+    print(f"{demo.about}\n\n{format_table(demo.comparison)}\n\n{demo.about_rendered}\n\n{format_table(demo.rendered)}\n")
+    print(f"reports: {demo.report} and {demo.rendered_report}\nplot:    {demo.plot}")
     return 0
 
 
@@ -70,7 +69,7 @@ def _doctor(arguments: argparse.Namespace) -> int:
 
     findings = diagnose()
     if arguments.json:
-        _print_json([finding.__dict__ for finding in findings])
+        print_json([finding.__dict__ for finding in findings])
     else:
         print(format_findings(findings))
     return 0 if all(finding.ok or not finding.required for finding in findings) else 3
@@ -134,7 +133,7 @@ def _convert(arguments: argparse.Namespace) -> int:
             recording = convert_to_asl(arguments.source, arguments.out, arguments.format, declared, progress.count)
     found = describe(recording)
     if arguments.json:
-        _print_json(found)
+        print_json(found)
     else:
         print(f"{arguments.out}: written as {arguments.to}")
         print("\n".join(f"{name.ljust(8)} {text}" for name, text in found.items()))
@@ -152,7 +151,7 @@ def _inspect(arguments: argparse.Namespace) -> int:
 
         write_inspection(replace(recording, name=arguments.html.stem), inspection, arguments.html)
     if arguments.json:
-        _print_json(inspection.to_dict())
+        print_json(inspection.to_dict())
     else:
         print(format_inspection(inspection))
     if inspection.usable:
@@ -160,54 +159,6 @@ def _inspect(arguments: argparse.Namespace) -> int:
     first = next(check for check in inspection.checks if check.level == "error")
     print(f"capsule-vio inspect: {first.text}", file=sys.stderr)
     return 3
-
-
-def _train(arguments: argparse.Namespace) -> int:
-    from learned.train_command import run_training
-    from vio.formats import open_recording
-
-    recordings, others = ([open_recording(path) for path in paths]
-                          for paths in (arguments.recordings, arguments.calibrate))
-    with Progress() as progress:
-        trained = run_training(recordings, others, vars(arguments), progress.count)
-    print(trained)
-    return 0
-
-
-def _evaluate(arguments: argparse.Namespace) -> int:
-    from learned.report import evaluate, format_evaluation
-    from learned.weights import load_weights
-    from vio.formats import open_recording
-
-    weights = load_weights(arguments.weights)
-    evaluation = evaluate([open_recording(path) for path in arguments.recordings], weights)
-    if arguments.json:
-        _print_json(evaluation.to_dict())
-    else:
-        print(format_evaluation(evaluation))
-    return 0
-
-
-def _predict(arguments: argparse.Namespace) -> int:
-    from vio.formats import open_recording
-
-    recording = open_recording(arguments.recording)
-    if arguments.method == "classical":
-        from vio.odometry import measure_recording
-
-        motions = measure_recording(recording)
-    else:
-        import learned
-
-        with Progress() as progress:
-            motions = learned.predict(recording, arguments.weights, rotation=arguments.rotation,
-                                      depth_dir=arguments.depth, progress=progress.count,
-                                      unfinished=arguments.out.with_name(f"{arguments.out.name}.unfinished"))
-    motions.save(arguments.out)
-    lost = motions.meta.get("unreadable_frames", {})
-    print(f"{arguments.out}: {len(motions)} motions"
-          + (f"; without frame {', '.join(lost)}: {next(iter(lost.values()))}" if lost else ""))
-    return 0
 
 
 def _refine(arguments: argparse.Namespace) -> int:
@@ -241,7 +192,7 @@ def _refine(arguments: argparse.Namespace) -> int:
             provenance = Provenance(["refine", "REC", "--out", "RUN"], config, inputs)
             summary = write_run(refined, arguments.out, provenance, motions)
     if arguments.json:
-        _print_json(summary)
+        print_json(summary)
     else:
         print(sentences(summary))
         print(f"run folder: {arguments.out}")
@@ -280,7 +231,7 @@ def _compare(arguments: argparse.Namespace) -> int:
     if arguments.out is not None:
         write_comparison(comparison, arguments.out)
     if arguments.json:
-        _print_json(comparison.to_dict())
+        print_json(comparison.to_dict())
     else:
         print(format_table(comparison))
     return 0
@@ -298,7 +249,7 @@ def _locate(arguments: argparse.Namespace) -> int:
     out = arguments.run if arguments.out is None else arguments.out
     paths = write_lesions(table, out)
     if arguments.json:
-        _print_json(table.to_dict())
+        print_json(table.to_dict())
     else:
         print(format_lesions(table))
         print("\n".join(str(path) for path in paths))

@@ -16,6 +16,8 @@ CAMERAS = ("mirocam", "fisheye-140", "fisheye-156", "pinhole-110")
 PRODUCTS = ("normals", "albedo", "mask", "flow")
 DATASETS = ("mm-wce",)
 METHODS = ("gyro-correlation", "endosfmlearner", "af-sfmlearner", "ra-depth", "endodac")
+TABLES = ("methods", "intensity", "vibration-types", "fusion", "corruptions")
+BUDGETS = ("smoke", "short", "full")
 FUSIONS = ("fourier", "concatenation", "summation", "gated", "aff", "iaff", "butd")
 
 
@@ -28,7 +30,7 @@ def build_parser() -> argparse.ArgumentParser:
     parser.add_argument("--version", action="version", version=f"%(prog)s {_version()}")
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
     for add in (_demo, _doctor, _simulate, _convert, _inspect, _train, _evaluate, _predict, _refine, _compare, _locate,
-                _report, _view):
+                _report, _view, _benchmark):
         add(commands)
     return parser
 
@@ -221,3 +223,19 @@ def _view(commands: Commands) -> None:
     parser.add_argument("--recording", type=Path, metavar="REC", help="the recording that was refined: its frames")
     parser.add_argument("--depth", type=Path, metavar="DIR", help="depth maps that predict --depth wrote")
     parser.add_argument("--out", type=Path, required=True, metavar="FILE.rrd")
+
+
+def _benchmark(commands: Commands) -> None:
+    parser = _command(commands, "benchmark", "measure one of the paper's tables; goes on where it was stopped "
+                      "(docs/benchmarks.md)", "benchmark fusion --data DATA --budget smoke --out OUT")
+    parser.add_argument("table", choices=TABLES)
+    parser.add_argument("--data", type=Path, required=True, metavar="DATA",
+                        help="what `simulate --dataset mm-wce --out DATA` wrote")
+    parser.add_argument("--budget", choices=BUDGETS, required=True,
+                        help="smoke: minutes, shows that it works; short: hours; full: the paper's, for GPUs")
+    parser.add_argument("--seeds", type=int, metavar="N", help="trainings per variant (default: the budget's)")
+    parser.add_argument("--method", choices=METHODS, default="af-sfmlearner",
+                        help="of all tables but `methods` (default: the paper's, af-sfmlearner)")
+    parser.add_argument("--device", choices=("cpu", "cuda"), help="default: cuda where there is one")
+    parser.add_argument("--out", type=Path, required=True, metavar="OUT")
+    _json(parser)

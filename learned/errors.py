@@ -21,3 +21,7 @@ class CheckpointError(VioError):
 
 class TrainingError(VioError):
     """Training that cannot go on: losses that are not finite, nothing to validate with."""
+
+
+class BenchmarkError(VioError):
+    """A table of the paper that cannot be measured: data that are missing or changed, or runs of another plan."""

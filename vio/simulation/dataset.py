@@ -155,7 +155,7 @@ def _is_there(sequence: Sequence, out: Path) -> bool:
 
 def _write_manifest(sequences: tuple[Sequence, ...], out: Path) -> Path:
     """What lies where, and a digest of every recording's bytes."""
-    entries = [asdict(sequence) | {"sha256": _digest(out / sequence.path)} for sequence in sequences]
+    entries = [asdict(sequence) | {"sha256": recording_digest(out / sequence.path)} for sequence in sequences]
     content = {"schema": 1, "simulator_version": SIMULATOR_VERSION, "frame_rate_hz": 3.0, "imu_rate_hz": 40.0,
                "sequences": entries}
     with atomic_write(out / MANIFEST) as file:
@@ -163,8 +163,8 @@ def _write_manifest(sequences: tuple[Sequence, ...], out: Path) -> Path:
     return out / MANIFEST
 
 
-def _digest(folder: Path) -> str:
-    """SHA-256 of all files of a recording, with their names, in the order of their names."""
+def recording_digest(folder: Path) -> str:
+    """SHA-256 of all files of a recording, with their names, in the order of their names: `sha256` of the manifest."""
     total = hashlib.sha256()
     for file in sorted(file for file in folder.rglob("*") if file.is_file()):
         total.update(file.relative_to(folder).as_posix().encode() + b"\0")

@@ -1,0 +1,73 @@
+"""The commands about networks: `train | evaluate | predict | benchmark`."""
+
+from __future__ import annotations
+
+import argparse
+
+from fusion.cli_output import print_json
+from fusion.cli_progress import Progress
+
+
+def train(arguments: argparse.Namespace) -> int:
+    """Train, and calibrate what was trained."""
+    from learned.train_command import run_training
+    from vio.formats import open_recording
+
+    recordings, others = ([open_recording(path) for path in paths]
+                          for paths in (arguments.recordings, arguments.calibrate))
+    with Progress() as progress:
+        trained = run_training(recordings, others, vars(arguments), progress.count)
+    print(trained)
+    return 0
+
+
+def evaluate(arguments: argparse.Namespace) -> int:
+    """Judge weights beside guesses without a network."""
+    from learned.report import evaluate, format_evaluation
+    from learned.weights import load_weights
+    from vio.formats import open_recording
+
+    weights = load_weights(arguments.weights)
+    evaluation = evaluate([open_recording(path) for path in arguments.recordings], weights)
+    if arguments.json:
+        print_json(evaluation.to_dict())
+    else:
+        print(format_evaluation(evaluation))
+    return 0
+
+
+def predict(arguments: argparse.Namespace) -> int:
+    """Measure relative motions."""
+    from vio.formats import open_recording
+
+    recording = open_recording(arguments.recording)
+    if arguments.method == "classical":
+        from vio.odometry import measure_recording
+
+        motions = measure_recording(recording)
+    else:
+        import learned
+
+        with Progress() as progress:
+            motions = learned.predict(recording, arguments.weights, rotation=arguments.rotation,
+                                      depth_dir=arguments.depth, progress=progress.count,
+                                      unfinished=arguments.out.with_name(f"{arguments.out.name}.unfinished"))
+    motions.save(arguments.out)
+    lost = motions.meta.get("unreadable_frames", {})
+    print(f"{arguments.out}: {len(motions)} motions"
+          + (f"; without frame {', '.join(lost)}: {next(iter(lost.values()))}" if lost else ""))
+    return 0
+
+
+def benchmark(arguments: argparse.Namespace) -> int:
+    """Measure one of the paper's tables."""
+    from learned.benchmark.command import run_table, summary
+
+    with Progress() as progress:
+        result = run_table(arguments.table, arguments.data, arguments.budget, arguments.out, seeds=arguments.seeds,
+                           method=arguments.method, device=arguments.device, progress=progress)
+    if arguments.json:
+        print_json(result)
+    else:
+        print(summary(result, arguments.out))
+    return 0
