@@ -12,7 +12,7 @@ import pytest
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGES = ("vio", "learned", "fusion")
 LIBRARY_FILES = sorted(file for package in PACKAGES for file in (ROOT / package).rglob("*.py"))
-COMMAND_LINE = ("fusion/cli.py", "fusion/cli_learned.py")
+COMMAND_LINE = ("fusion/cli.py", "fusion/cli_learned.py", "fusion/cli_output.py")
 LONGEST_FILE = 350
 
 OURS = {"vio": {"vio"}, "learned": {"learned", "vio"}, "fusion": {"fusion", "vio"}}
