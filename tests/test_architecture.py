@@ -30,7 +30,7 @@ HEAVY = {
     "matplotlib": ("fusion/report/",),
     "rerun": ("fusion/view.py",),
     "tqdm": ("fusion/cli_progress.py",),
-    "argparse": (*COMMAND_LINE, "fusion/cli_parser.py"),
+    "argparse": ("fusion/cli.py", "fusion/cli_learned.py", "fusion/cli_parser.py"),
     "evo": (),
     "pytest": (),
     "hypothesis": (),
