@@ -91,9 +91,8 @@ def decisions(budget: Budget, method: str, fusion: str | None, seed: int, frames
     config = method_config(method, vibration=fusion is not None, fusion=strategy, width=budget.width, **options)
     steps = budget.steps if budget.steps is not None else _epochs(budget, frames)
     validate_every = max(steps // VALIDATIONS, FEWEST_STEPS_TO_VALIDATE)
-    return train_config(config, steps=steps, batch_size=budget.batch_size, seed=seed,
-                        log_every=max(steps // 100, 1), validate_every=validate_every,
-                        checkpoint_every=max(steps // CHECKPOINTS, 1))
+    return train_config(config, steps=steps, batch_size=budget.batch_size, seed=seed, log_every=max(steps // 100, 1),
+                        validate_every=validate_every, checkpoint_every=max(steps // CHECKPOINTS, 1))
 
 
 def _epochs(budget: Budget, frames: list[int]) -> int:

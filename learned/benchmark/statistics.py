@@ -85,7 +85,7 @@ def bootstrap_interval(cells: Array, rng: np.random.Generator) -> tuple[float, f
     seeds, sequences = cells.shape
     rows = rng.multinomial(seeds, np.full(seeds, 1 / seeds), DRAWS) / seeds
     columns = rng.multinomial(sequences, np.full(sequences, 1 / sequences), DRAWS) / sequences
-    means = np.einsum("ds,sq,dq->d", rows, cells, columns)
+    means = ((rows @ cells) * columns).sum(axis=1)
     tail = 50 * (1 - COVERAGE)
     low, high = np.percentile(means, [tail, 100 - tail])
     return float(low), float(high)

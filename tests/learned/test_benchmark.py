@@ -146,6 +146,11 @@ def test_another_plan_and_damaged_results_are_noticed(finished, data, tmp_path, 
         assert main(command(data, out)) == 3
         complaint = last_line(capsys)
         assert "test_frames, training.method.width" in complaint and "another --out" in complaint
+    with monkeypatch.context() as patch:  # how often a training is validated changes no weight
+        patch.setattr("learned.benchmark.budgets.FEWEST_STEPS_TO_VALIDATE", 1)
+        assert main(command(data, out)) == 0
+        assert (out / "vibration-types.json").read_bytes() == table
+    capsys.readouterr()
     for text, what in (("{", "cannot be read; delete it"), (json.dumps(json.loads(part.read_text()) | {"schema": 9}),
                                                           "has schema 9")):
         part.write_text(text)
