@@ -210,6 +210,8 @@ def _predict(arguments: argparse.Namespace) -> int:
         from vio.odometry import measure_recording
 
         motions = measure_recording(recording)
+    elif arguments.method == "depth-aligned":
+        motions = _depth_aligned(recording, arguments)
     else:
         import learned
 
@@ -219,6 +221,16 @@ def _predict(arguments: argparse.Namespace) -> int:
     motions.save(arguments.out)
     print(f"{arguments.out}: {len(motions)} motions")
     return 0
+
+
+def _depth_aligned(recording: Any, arguments: argparse.Namespace) -> Any:
+    from learned.depth_aligned import depth_aligned_motions
+
+    if arguments.depth is not None or arguments.rotation != "network":
+        raise UsageError("--method depth-aligned goes without --depth and --rotation gyro, which belong to --method "
+                         "learned")
+    with _Progress() as progress:
+        return depth_aligned_motions(recording, arguments.weights, progress=progress.count)
 
 
 def _refine(arguments: argparse.Namespace) -> int:

@@ -28,7 +28,7 @@ from learned.errors import PredictionError
 from learned.frames import resized_rgb
 from learned.gyro_update import GyroRotations
 from learned.network_predictor import NetworkPredictor, predictor_for
-from learned.predictor import Predictor
+from learned.predictor import JudgesDepth, Predictor
 from learned.weights import load_weights
 from learned.windows import ImuWindows
 from vio.errors import ConfigError, RecordingError
@@ -48,6 +48,8 @@ class Prediction(RelativeMotions):
 
     depth: tuple[Path, ...] | None = None
     """16-bit z-depth of every frame; None when no folder was asked for."""
+    depth_sd: tuple[Path, ...] | None = None
+    """16-bit standard deviation of ln depth of every frame; None when the weights cannot say, as `meta` does."""
 
     @property
     def motions(self) -> RelativeMotions:
@@ -127,6 +129,9 @@ def predict(
         if depth_dir is not None:
             scale = float(np.exp(predictor.scale_log_mean))
             maps = stack.enter_context(depth_folder(depth_dir, depth_unit_m, scale, meta))
+            judged = predictor.depth_uncertainty_card if isinstance(predictor, JudgesDepth) else None
+            maps.with_sd = judged is not None
+            meta["depth_uncertainty"] = "never calibrated, so there are no sd maps" if judged is None else dict(judged)
         items = _items(recording, predictor, maps is not None)
         while batch := list(islice(items, batch_size)):
             done.append(_predict_batch(recording, predictor, windows, batch, maps))
@@ -144,7 +149,7 @@ def predict(
         t_i_s=t[i], t_j_s=t[j], T_i_j=T, cov=cov,
         scale_log_mean=predictor.scale_log_mean, scale_log_sd=predictor.scale_log_sd,
         snr=np.concatenate(snr) if snr else None, meta=meta,
-        depth=None if maps is None else maps.files,
+        depth=None if maps is None else maps.files, depth_sd=None if maps is None else maps.sd_files,
     )
 
 
@@ -219,7 +224,7 @@ def _predict_batch(
     cov = _numbers(out.cov, "cov", (n, 6, 6), batch)
     snr = None if out.snr is None else _numbers(out.snr, "snr", (n,), batch)
     if maps is not None:
-        _write_depth(recording, out.depth_i, batch, maps)
+        _write_depth(recording, predictor, out.depth_i, batch, maps)
     pair = np.array([item.i != item.j for item in batch])
     i, j = np.array([item.i for item in batch], np.int64), np.array([item.j for item in batch], np.int64)
     return _Batch(i[pair], j[pair], T[pair], cov[pair], None if snr is None else snr[pair])
@@ -240,7 +245,7 @@ def _numbers(values: torch.Tensor, name: str, shape: tuple[int, ...], batch: lis
 
 
 def _write_depth(
-    recording: Recording, depth: torch.Tensor | None, batch: list[_Item], maps: DepthMaps
+    recording: Recording, predictor: Predictor, depth: torch.Tensor | None, batch: list[_Item], maps: DepthMaps
 ) -> None:
     if depth is None:
         raise PredictionError("predictor: it predicts no depth; leave the depth folder (`--depth`) out")
@@ -248,11 +253,25 @@ def _write_depth(
         raise PredictionError(
             f"predictor: depth_i has shape {tuple(depth.shape)} for {len(batch)} pairs, expected ({len(batch)}, h, w)"
         )
-    camera = recording.calibration.camera
-    for item, values in zip(batch, depth.detach().cpu().double().numpy(), strict=True):
+    camera, sd = recording.calibration.camera, _depth_sd(predictor, depth, batch) if maps.with_sd else None
+    for n, (item, values) in enumerate(zip(batch, depth.detach().cpu().double().numpy(), strict=True)):
         if item.depth_wanted:
             shape = tuple(values.shape) if camera is None else (camera.height, camera.width)
-            maps.write(int(recording.frame_t_ns[item.i]), values, (shape[0], shape[1]))
+            maps.write(int(recording.frame_t_ns[item.i]), values, (shape[0], shape[1]), None if sd is None else sd[n])
+
+
+def _depth_sd(predictor: Predictor, depth: torch.Tensor, batch: list[_Item]) -> Array | None:
+    """Standard deviation (B, h, w) of ln depth, after a look at it."""
+    if not isinstance(predictor, JudgesDepth):
+        return None
+    found = predictor.log_depth_sd(torch.stack([item.frame_i for item in batch]), depth)
+    if found is None:
+        return None
+    sd = found.detach().cpu().double().numpy()
+    if sd.shape != tuple(depth.shape) or not (np.isfinite(sd) & (sd > 0)).all():
+        raise PredictionError(f"predictor: log_depth_sd of frames {batch[0].i} to {batch[-1].i} has shape {sd.shape}, "
+                              f"expected {tuple(depth.shape)} with finite positive values; calibrate again")
+    return np.asarray(sd)
 
 
 def _version() -> str:
