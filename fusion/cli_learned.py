@@ -3,9 +3,15 @@
 from __future__ import annotations
 
 import argparse
+from typing import TYPE_CHECKING
 
 from fusion.cli_output import print_json
 from fusion.cli_progress import Progress
+from vio.errors import UsageError
+
+if TYPE_CHECKING:
+    from vio.motions import RelativeMotions
+    from vio.recording import Recording
 
 
 def train(arguments: argparse.Namespace) -> int:
@@ -45,6 +51,8 @@ def predict(arguments: argparse.Namespace) -> int:
         from vio.odometry import measure_recording
 
         motions = measure_recording(recording)
+    elif arguments.method == "depth-aligned":
+        motions = _depth_aligned(recording, arguments)
     else:
         import learned
 
@@ -57,6 +65,16 @@ def predict(arguments: argparse.Namespace) -> int:
     print(f"{arguments.out}: {len(motions)} motions"
           + (f"; without frame {', '.join(lost)}: {next(iter(lost.values()))}" if lost else ""))
     return 0
+
+
+def _depth_aligned(recording: Recording, arguments: argparse.Namespace) -> RelativeMotions:
+    from learned.depth_aligned import depth_aligned_motions
+
+    if arguments.depth is not None or arguments.rotation != "network":
+        raise UsageError("--method depth-aligned goes without --depth and --rotation gyro, which belong to --method "
+                         "learned")
+    with Progress() as progress:
+        return depth_aligned_motions(recording, arguments.weights, progress=progress.count)
 
 
 def benchmark(arguments: argparse.Namespace) -> int:

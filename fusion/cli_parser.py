@@ -153,12 +153,13 @@ def _predict(commands: Commands) -> None:
     parser = _command(commands, "predict", "measure relative motions on a recording's images",
                       "predict REC --method classical --out motions.npz")
     parser.add_argument("recording", type=Path, metavar="REC")
-    parser.add_argument("--method", choices=("learned", "classical"), default="learned",
-                        help="a trained network, or KLT tracks with essential matrix and PnP")
+    parser.add_argument("--method", choices=("learned", "depth-aligned", "classical"), default="learned",
+                        help="a trained network; KLT tracks laid over each other by its depth; or KLT tracks with "
+                             "essential matrix and PnP")
     parser.add_argument("--weights", type=Path, metavar="W", help="default: those that come with the library")
     parser.add_argument("--rotation", choices=("network", "gyro"), default="network",
                         help="gyro: correct the rotation by the gyro; for use without `refine`, which does so itself")
-    parser.add_argument("--depth", type=Path, metavar="DIR", help="also write the predicted depth maps")
+    parser.add_argument("--depth", type=Path, metavar="DIR", help="also write the predicted depth maps and their sd")
     parser.add_argument("--out", type=Path, required=True, metavar="motions.npz")
 
 

@@ -5,8 +5,10 @@
     motions = learned.predict(recording, predictor)
 """
 
+from learned.depth_aligned import depth_aligned_motions
 from learned.errors import PredictionError, WeightsError
 from learned.predict import Prediction, predict
 from learned.predictor import PairPrediction, Predictor
 
-__all__ = ["PairPrediction", "Prediction", "PredictionError", "Predictor", "WeightsError", "predict"]
+__all__ = ["PairPrediction", "Prediction", "PredictionError", "Predictor", "WeightsError", "depth_aligned_motions",
+           "predict"]

@@ -13,15 +13,17 @@ from typing import Any
 
 import numpy as np
 
+from learned.aligned_calibration import aligned_section
 from learned.dataset import frames_of_split
-from learned.errors import TrainingError
+from learned.depth_calibration import depth_uncertainty_section
+from learned.errors import TrainingError, WeightsError
 from learned.evaluation import angle_deg, depth_score, motion_score, nees_of
 from learned.inference import SIGNALS
 from learned.measured import Measured, measure
 from learned.train_config import train_config_to_dict
 from learned.training import TrainedRun
-from learned.uncertainty import choose_signals, fit_uncertainty
-from learned.weights import load_weights, save_weights
+from learned.uncertainty import UncertaintyModel, choose_signals, fit_uncertainty, uncertainty_from_dict
+from learned.weights import load_weights, rewrite_card, save_weights
 from vio.recording import Recording
 
 LEAST_PAIRS = 60
@@ -99,6 +101,7 @@ def calibrated(measured: Sequence[Measured]) -> dict[str, Any]:
     gyro = [np.radians(angle_deg(_transforms(m.R_gyro), m.T_true_m)) for m in used if m.R_gyro is not None]
     depth, motion = depth_score([m.depth for m in used], used), motion_score([m.T_i_j for m in used], used)
     return {
+        **depth_sections(used, model, float(np.mean(scales))),
         "scale_log_mean": float(np.mean(scales)), "scale_log_sd": max(spread, LEAST_SCALE_SD),
         "uncertainty": model.to_dict(),
         # Root mean square per axis: noise, and the bias that nobody has removed.
@@ -106,6 +109,49 @@ def calibrated(measured: Sequence[Measured]) -> dict[str, Any]:
         "calibration": {"pairs": pairs, "recordings": len(used), "nees": float(nees_of(used, model, SIGNALS).mean()),
                         "depth": None if depth is None else asdict(depth), "motion": asdict(motion)},
     }
+
+
+def depth_sections(measured: Sequence[Measured], network: UncertaintyModel, scale_log_mean: float) -> dict[str, Any]:
+    """The card's `depth_uncertainty` and `depth_aligned`; each None where recordings do not suffice.
+
+    Args:
+        measured: calibration recordings.
+        network: covariances of the pose network.
+        scale_log_mean: ln(metres per motion unit) of the prior.
+    """
+    return {"depth_uncertainty": depth_uncertainty_section(measured, scale_log_mean),
+            "depth_aligned": aligned_section(measured, network)}
+
+
+def extend_card(source: str | Path, path: str | Path, calibrate_on: Sequence[Recording]) -> dict[str, Any]:
+    """Add `depth_uncertainty` and `depth_aligned` to the card of calibrated weights, without training.
+
+    Args:
+        source: weights whose motions are calibrated.
+        path: where the same weights are written under the longer card, may be `source`.
+        calibrate_on: recordings with truth and true depth that the weights were not trained on.
+
+    Returns:
+        The card.
+
+    Raises:
+        WeightsError: weights that cannot be read, or whose motions were never calibrated.
+        TrainingError: recordings that do not suffice.
+        RecordingError, ImuError: recordings that cannot be measured.
+        OutputError: the file cannot be written.
+    """
+    weights = load_weights(source)
+    if weights.card["uncertainty"] is None:
+        raise WeightsError(f"weights {weights.name}: their motions were never calibrated; run `capsule-vio train` with "
+                           "recordings that have truth")
+    measured = [measure(weights.method, weights.card["depth_kind"], recording) for recording in calibrate_on]
+    sections = depth_sections(measured, uncertainty_from_dict(weights.card["uncertainty"]),
+                              float(weights.card["scale_log_mean"]))
+    missing = [name for name, section in sections.items() if section is None]
+    if missing:
+        raise TrainingError(f"calibration: {len(measured)} recordings do not suffice for {' and '.join(missing)}; "
+                            "give more or longer ones with true depth and texture")
+    return rewrite_card(source, path, {**sections, "depth_calibrated_on": _data(calibrate_on)})
 
 
 def _transforms(R: np.ndarray[Any, np.dtype[np.float64]]) -> np.ndarray[Any, np.dtype[np.float64]]:

@@ -3,6 +3,7 @@
     DIR/data.csv             #timestamp [ns],filename
     DIR/data/<stamp>.png     16-bit z-depth, 0 = unknown
     DIR/sensor.yaml          depth_unit_m: metres per count
+    DIR/sd/<stamp>.png       16-bit sd of ln depth in 1e-4, 0 = unknown; only from weights that can say
     DIR/prediction.json      where they come from; marks the folder as ours
 """
 
@@ -24,7 +25,10 @@ from vio.atomic import atomic_folder
 from vio.errors import ConfigError
 
 MARKER = "prediction.json"
+SD_FOLDER = "sd"
 LARGEST_COUNT = 65535
+LOG_SD_UNIT = 1e-4
+"""Standard deviation of ln depth per count of the sd maps."""
 
 
 @dataclass
@@ -39,23 +43,28 @@ class DepthMaps:
     """Metres per count; 65535 counts are the farthest depth that can be stored."""
     metres_per_unit: float
     """Metres per motion unit, the predictor's prior."""
+    with_sd: bool = False
+    """Whether a map of standard deviations lies beside every depth map."""
     names: list[str] = field(default_factory=list)
 
-    def write(self, t_ns: int, depth: NDArray[np.float64], shape: tuple[int, int]) -> None:
+    def write(self, t_ns: int, depth: NDArray[np.float64], shape: tuple[int, int],
+              log_sd: NDArray[np.float64] | None = None) -> None:
         """Write the map of the frame at `t_ns`.
 
         Args:
             t_ns: stamp of the frame.
             depth: (h, w) z-depth in motion units; not finite or not positive where unknown.
             shape: (H, W) of the frame; a smaller or larger map is brought to it by nearest neighbour.
+            log_sd: (h, w) standard deviation of ln depth; None = unknown everywhere. Written when `with_sd`.
         """
         counts = np.where(np.isfinite(depth), depth, 0.0) * (self.metres_per_unit / self.unit_m)
         known = (counts >= 0.5) & (counts <= LARGEST_COUNT)
-        image = np.where(known, np.rint(counts), 0).astype(np.uint16)
-        if image.shape != shape:
-            image = cv2.resize(image, (shape[1], shape[0]), interpolation=cv2.INTER_NEAREST).astype(np.uint16)
         name = f"{t_ns}.png"
-        (self.images / name).write_bytes(cv2.imencode(".png", image)[1].tobytes())
+        _write_counts(self.images / name, np.where(known, counts, 0), shape)
+        if self.with_sd:
+            sd = np.zeros(depth.shape) if log_sd is None else np.clip(log_sd / LOG_SD_UNIT, 1, LARGEST_COUNT)
+            (self.folder / SD_FOLDER).mkdir(exist_ok=True)
+            _write_counts(self.folder / SD_FOLDER / name, np.where(known, sd, 0), shape)
         self.names.append(name)
 
     @property
@@ -64,9 +73,28 @@ class DepthMaps:
         return self.folder / "data"
 
     @property
+    def folders(self) -> tuple[Path, ...]:
+        """Every folder that gets one file per map now."""
+        return (self.images, self.folder / SD_FOLDER) if self.with_sd else (self.images,)
+
+    @property
     def files(self) -> tuple[Path, ...]:
         """The maps, in the order of their frames."""
         return tuple(self.target / "data" / name for name in sorted(self.names, key=_stamp))
+
+    @property
+    def sd_files(self) -> tuple[Path, ...] | None:
+        """The maps of standard deviations, in the order of their frames; None when none are written."""
+        if not self.with_sd:
+            return None
+        return tuple(self.target / SD_FOLDER / name for name in sorted(self.names, key=_stamp))
+
+
+def _write_counts(path: Path, counts: NDArray[np.float64], shape: tuple[int, int]) -> None:
+    image = np.rint(counts).astype(np.uint16)
+    if image.shape != shape:
+        image = cv2.resize(image, (shape[1], shape[0]), interpolation=cv2.INTER_NEAREST).astype(np.uint16)
+    path.write_bytes(cv2.imencode(".png", image)[1].tobytes())
 
 
 @contextmanager
@@ -88,6 +116,8 @@ def depth_folder(
         rows = ["#timestamp [ns],filename", *(f"{_stamp(name)},{name}" for name in sorted(maps.names, key=_stamp))]
         (folder / "data.csv").write_text("\n".join(rows) + "\n", encoding="utf-8")
         sensor = {"sensor_type": "depth", "depth_unit_m": float(unit_m)}
+        if maps.with_sd:
+            sensor["log_depth_sd_unit"] = LOG_SD_UNIT
         (folder / "sensor.yaml").write_text(yaml.safe_dump(sensor, sort_keys=False), encoding="utf-8")
         (folder / MARKER).write_text(json.dumps(dict(meta), indent=2, sort_keys=True) + "\n", encoding="utf-8")
 

@@ -15,6 +15,7 @@ from learned.training_source import SourceSettings, TrainingSource
 from learned.truth import truth_of
 from learned.warping import DepthKind
 from vio import se3
+from vio.camera import Camera
 from vio.errors import RecordingError
 from vio.recording import Recording
 
@@ -49,6 +50,8 @@ class Measured:
     """(N, S) of `learned.inference.SIGNALS`."""
     step_s: Array
     """(N,) between the frames."""
+    camera: Camera
+    """At the network's size."""
 
     def __len__(self) -> int:
         return len(self.T_i_j)
@@ -114,4 +117,5 @@ def measure(method: Method, depth_kind: DepthKind, recording: Recording, first: 
         torch.cat([part.z_depth_i[:, 0] for part in parts]).numpy(), depth_true,
         torch.cat([part.T_i_j for part in parts]).double().numpy(), truth.T_i_j.numpy(),
         source.rotations(index) if settings.imu else None,
-        torch.cat([part.signals for part in parts]).double().numpy(), np.diff(recording.frame_t_s[index]))
+        torch.cat([part.signals for part in parts]).double().numpy(), np.diff(recording.frame_t_s[index]),
+        source.camera)

@@ -4,15 +4,19 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any
 
 import torch
 
 from learned.camera_rays import CameraBatch, camera_batch
+from learned.depth_uncertainty import DepthUncertainty, depth_uncertainty_from_dict
 from learned.errors import WeightsError
 from learned.inference import SIGNALS, estimate_pairs
+from learned.pixel_signals import off_axis_angle, pixel_signals
 from learned.predictor import PairPrediction
 from learned.uncertainty import UncertaintyModel, uncertainty_from_dict
+from learned.warping import to_z_depth
 from learned.weights import Weights
 from vio.camera import Camera
 from vio.errors import CameraError, ImuError
@@ -33,6 +37,8 @@ class NetworkPredictor:
     """At the network's size."""
     uncertainty: UncertaintyModel
     device: torch.device
+    depth_uncertainty: DepthUncertainty | None = None
+    """Of the depth per pixel; None for weights whose depth was never calibrated."""
     baselines: tuple[int, ...] = (1,)
 
     @property
@@ -71,11 +77,46 @@ class NetworkPredictor:
     def predict(self, frames_i: torch.Tensor, frames_j: torch.Tensor, imu_windows: torch.Tensor) -> PairPrediction:
         """Motions of B pairs, with covariances, SNR and depth; see `learned.Predictor`."""
         frames = torch.stack([frames_i, frames_j], 1).to(self.device)
-        windows = imu_windows.transpose(1, 2).to(self.device) if self.imu_samples_per_item else None
+        windows = self._windows(imu_windows)
         estimate = estimate_pairs(self.weights.method, frames, windows, self._cameras(len(frames)),
                                   self.weights.card["depth_kind"])
         cov = self.uncertainty.covariance(estimate.signals.cpu().double().numpy(), SIGNALS)
         return PairPrediction(estimate.T_i_j.double(), torch.from_numpy(cov), estimate.snr, estimate.z_depth_i[:, 0])
+
+    def depth(self, frames: torch.Tensor, imu_windows: torch.Tensor) -> torch.Tensor:
+        """z-depth (B, H, W) of frames (B, 3, H, W) in motion units, without any motion; 0 where nothing is seen."""
+        with torch.no_grad():
+            out = self.weights.method(frames[:, None].to(self.device), self._windows(imu_windows), depth_frames=(0,),
+                                      pairs=())
+        depth = out.depth[0].depth[0].float()
+        return to_z_depth(depth, self._cameras(len(frames)), self.weights.card["depth_kind"])[:, 0]
+
+    def log_depth_sd(self, frames: torch.Tensor, z_depth: torch.Tensor) -> torch.Tensor | None:
+        """Standard deviation (B, H, W) of ln depth, once an image's scale is right; None for weights without it.
+
+        Args:
+            frames: (B, 3, H, W) in 0..1.
+            z_depth: (B, H, W) what was predicted for them.
+        """
+        if self.depth_uncertainty is None:
+            return None
+        depth = z_depth.float().cpu()
+        return self.depth_uncertainty.deviations(pixel_signals(frames.cpu(), depth, self._angle))
+
+    @property
+    def depth_uncertainty_card(self) -> Mapping[str, Any] | None:
+        """What is needed beside `log_depth_sd`; see `learned.predictor.JudgesDepth`."""
+        model = self.depth_uncertainty
+        return None if model is None else {
+            "interval_95": model.interval_95, "common_log_sd": model.common_log_sd,
+            "prior_interval_95": model.prior_interval_95, "signals": list(model.signals)}
+
+    @cached_property
+    def _angle(self) -> torch.Tensor:
+        return torch.from_numpy(off_axis_angle(self.camera))
+
+    def _windows(self, imu_windows: torch.Tensor) -> torch.Tensor | None:
+        return imu_windows.transpose(1, 2).to(self.device) if self.imu_samples_per_item else None
 
     def _cameras(self, count: int) -> CameraBatch:
         return camera_batch([self.camera]).to(self.device).repeated(count)
@@ -102,9 +143,10 @@ def predictor_for(recording: Recording, weights: Weights, device: str | None = N
         raise ImuError(f"recording {recording.name}: {len(recording.imu)} inertial samples, but the weights {name} "
                        "look at vibration; add imu0/data.csv, give vision-only weights, or use --method classical")
     chosen = torch.device(device or ("cuda" if torch.cuda.is_available() else "cpu"))
-    camera = _fitting_camera(recording, weights)
+    camera, of_depth = _fitting_camera(recording, weights), weights.card.get("depth_uncertainty")
     return NetworkPredictor(replace(weights, method=method.to(chosen)), camera,
-                            uncertainty_from_dict(weights.card["uncertainty"]), chosen)
+                            uncertainty_from_dict(weights.card["uncertainty"]), chosen,
+                            None if of_depth is None else depth_uncertainty_from_dict(of_depth))
 
 
 def _fitting_camera(recording: Recording, weights: Weights) -> Camera:

@@ -11,27 +11,24 @@ cannot be read lose their motions and are named; nothing stands in for their pix
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from contextlib import ExitStack
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from importlib.metadata import PackageNotFoundError, version
-from itertools import islice
 from pathlib import Path
 from typing import Any, Literal, get_args
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
 from learned.depth_maps import DepthMaps, depth_folder
 from learned.errors import PredictionError
 from learned.gyro_update import GyroRotations
 from learned.network_predictor import NetworkPredictor, predictor_for
-from learned.pairs import FrameReader, Pair, Shown, pairs_of
-from learned.predictor import Predictor
-from learned.unfinished import MeasuredPairs, Part, Unfinished, images_digest
+from learned.prediction_run import PredictionRun
+from learned.predictor import JudgesDepth, Predictor
+from learned.unfinished import MeasuredPairs, Unfinished, images_digest
 from learned.weights import load_weights
-from learned.windows import ImuWindows
 from vio.errors import ConfigError, RecordingError
 from vio.motions import RelativeMotions
 from vio.recording import Recording
@@ -41,8 +38,6 @@ Progress = Callable[[int, int], None]
 Rotation = Literal["network", "gyro"]
 
 DEPTH_UNIT_M = 1e-5  # 0.01 mm per count reaches 655 mm, further than a capsule sees
-PAIRS_KEPT = 512
-"""About how many pairs an interrupted prediction may lose."""
 
 
 @dataclass(frozen=True)
@@ -51,6 +46,8 @@ class Prediction(RelativeMotions):
 
     depth: tuple[Path, ...] | None = None
     """16-bit z-depth of every frame, unknown where a frame cannot be read; None when no folder was asked for."""
+    depth_sd: tuple[Path, ...] | None = None
+    """16-bit standard deviation of ln depth of every frame; None when the weights cannot say, as `meta` does."""
 
     @property
     def motions(self) -> RelativeMotions:
@@ -107,11 +104,14 @@ def predict(
     t = recording.frame_t_s
     meta: dict[str, Any] = {"source": "learned", "predictor": dict(predictor.card), "library_version": _version(),
                             "rotation": rotation}
-    run = _Run(recording, predictor, batch_size, progress)
+    run = PredictionRun(recording, predictor, batch_size, progress)
     with ExitStack() as stack:
         if depth_dir is not None:
             scale = float(np.exp(predictor.scale_log_mean))
             run.maps = stack.enter_context(depth_folder(depth_dir, depth_unit_m, scale, meta))
+            judged = predictor.depth_uncertainty_card if isinstance(predictor, JudgesDepth) else None
+            run.maps.with_sd = judged is not None
+            meta["depth_uncertainty"] = "never calibrated, so there are no sd maps" if judged is None else dict(judged)
         if unfinished is not None:
             run.unfinished = Unfinished(unfinished, _question(recording, predictor, batch_size, run.maps))
         run.measure()
@@ -127,97 +127,18 @@ def predict(
         t_i_s=t[i], t_j_s=t[j], T_i_j=T, cov=cov,
         scale_log_mean=predictor.scale_log_mean, scale_log_sd=predictor.scale_log_sd,
         snr=snr, meta=meta, depth=None if run.maps is None else run.maps.files,
+        depth_sd=None if run.maps is None else run.maps.sd_files,
     )
     if run.unfinished is not None:
         run.unfinished.discard()
     return prediction
 
 
-@dataclass
-class _Run:
-    """One pass over a recording."""
-
-    recording: Recording
-    predictor: Predictor
-    batch_size: int
-    progress: Progress | None
-    maps: DepthMaps | None = None
-    unfinished: Unfinished | None = None
-    done: list[MeasuredPairs] = field(default_factory=list)
-    unreadable: dict[int, str] = field(default_factory=dict)
-
-    def __post_init__(self) -> None:
-        self.windows = ImuWindows(self.recording.imu, self.recording.imu_t_s, self.recording.frame_t_s,
-                                  self.predictor.imu_samples_per_item, self.predictor.imu_rate_hz)
-        self.smallest_batch = self.batch_size
-        self.reader = FrameReader(self.recording, self.predictor.image_size, max(self.predictor.baselines) + 1)
-
-    def measure(self) -> None:
-        """Show all pairs that no earlier run has measured to the predictor."""
-        every = list(pairs_of(len(self.recording), self.predictor.baselines, self.maps is not None))
-        passed = self._take_up()
-        part = max(1, PAIRS_KEPT // self.batch_size) * self.batch_size
-        for first in range(passed, len(every), part):
-            self._measure_part(every[first: first + part], first, len(every))
-
-    def mark_unreadable(self) -> None:
-        """Frames that cannot be read get a map that knows nothing, so that maps and frames stay side by side."""
-        if self.maps is not None:
-            for k in self.unreadable:
-                shape = _frame_shape(self.recording, (1, 1))
-                self.maps.write(int(self.recording.frame_t_ns[k]), np.zeros(shape), shape)
-
-    def _take_up(self) -> int:
-        parts = [] if self.unfinished is None else self.unfinished.taken_up()
-        if self.maps is not None and self.unfinished is not None:
-            self.unfinished.restore_maps(parts, self.maps.images)
-            self.maps.names += [name for part in parts for name in part.maps]
-        for part in parts:
-            self.done += part.measured
-            self.unreadable |= part.unreadable
-        return sum(part.pairs_passed for part in parts)
-
-    def _measure_part(self, pairs: list[Pair], passed: int, total: int) -> None:
-        measured: list[MeasuredPairs] = []
-        shown = passed
-        maps_before = 0 if self.maps is None else len(self.maps.names)
-        for batch in _batches(self.reader.shown(pairs), self.batch_size):
-            measured += self._fitting(batch)
-            shown += len(batch)
-            if self.progress is not None:
-                self.progress(shown, total)
-        self.done += measured
-        unreadable = {k: reason for k, reason in self.reader.unreadable.items() if k not in self.unreadable}
-        self.unreadable |= unreadable
-        if self.unfinished is not None:
-            names = [] if self.maps is None else self.maps.names[maps_before:]
-            self.unfinished.keep(Part(len(pairs), measured, unreadable, names),
-                                 None if self.maps is None else self.maps.images)
-
-
-    def _fitting(self, batch: list[Shown]) -> list[MeasuredPairs]:
-        """One batch, in halves where the accelerator's memory does not hold it."""
-        try:
-            return [_predict_batch(self.recording, self.predictor, self.windows, batch, self.maps)]
-        except torch.OutOfMemoryError:
-            if len(batch) == 1:
-                raise PredictionError("predictor: one pair of frames does not fit the accelerator's memory; use the "
-                                      "CPU (CUDA_VISIBLE_DEVICES=) or smaller weights") from None
-        torch.cuda.empty_cache()
-        middle = len(batch) // 2
-        self.smallest_batch = min(self.smallest_batch, middle)
-        return [*self._fitting(batch[:middle]), *self._fitting(batch[middle:])]
-
-
-def _batches(items: Iterator[Shown], size: int) -> Iterator[list[Shown]]:
-    while batch := list(islice(items, size)):
-        yield batch
-
-
 def _question(recording: Recording, predictor: Predictor, batch_size: int, maps: DepthMaps | None) -> dict[str, Any]:
     """All that decides what is measured."""
     return {"images": images_digest(recording), "predictor": dict(predictor.card), "batch_size": batch_size,
             "baselines": list(predictor.baselines), "depth_unit_m": None if maps is None else maps.unit_m,
+            "with_sd": maps is not None and maps.with_sd,
             "library_version": _version()}
 
 
@@ -260,59 +181,6 @@ def _check(recording: Recording, predictor: Predictor) -> None:
         raise RecordingError(
             f"recording {recording.name}: images are missing; restore cam0/data, or give motions with `--motions`"
         )
-
-
-def _predict_batch(
-    recording: Recording, predictor: Predictor, windows: ImuWindows, batch: list[Shown], maps: DepthMaps | None
-) -> MeasuredPairs:
-    imu = torch.from_numpy(windows.at(recording.frame_t_s[[item.pair.i for item in batch]])).float()
-    with torch.inference_mode():
-        out = predictor.predict(
-            torch.stack([item.frame_i for item in batch]), torch.stack([item.frame_j for item in batch]), imu
-        )
-    n = len(batch)
-    T = _numbers(out.T_i_j, "T_i_j", (n, 4, 4), batch)
-    cov = _numbers(out.cov, "cov", (n, 6, 6), batch)
-    snr = None if out.snr is None else _numbers(out.snr, "snr", (n,), batch)
-    if maps is not None:
-        _write_depth(recording, out.depth_i, batch, maps)
-    i, j = np.array([(item.pair.i, item.pair.j) for item in batch], np.int64).T
-    pair = i != j
-    return MeasuredPairs(i[pair], j[pair], T[pair], cov[pair], None if snr is None else snr[pair])
-
-
-def _numbers(values: torch.Tensor, name: str, shape: tuple[int, ...], batch: list[Shown]) -> Array:
-    """The tensor in numpy, after a look at its shape and its values."""
-    if tuple(values.shape) != shape:
-        raise PredictionError(f"predictor: {name} has shape {tuple(values.shape)}, expected {shape}: one entry a pair")
-    array = values.detach().cpu().double().numpy()
-    finite = np.isfinite(array).reshape(len(array), -1).all(axis=1)
-    if not finite.all():
-        pair = batch[int(np.argmin(finite))].pair
-        raise PredictionError(
-            f"predictor: {name} of frames {pair.i} to {pair.j} is not finite; look at these frames or use other weights"
-        )
-    return np.asarray(array)
-
-
-def _write_depth(
-    recording: Recording, depth: torch.Tensor | None, batch: list[Shown], maps: DepthMaps
-) -> None:
-    if depth is None:
-        raise PredictionError("predictor: it predicts no depth; leave the depth folder (`--depth`) out")
-    if depth.ndim != 3 or len(depth) != len(batch):
-        raise PredictionError(
-            f"predictor: depth_i has shape {tuple(depth.shape)} for {len(batch)} pairs, expected ({len(batch)}, h, w)"
-        )
-    for item, values in zip(batch, depth.detach().cpu().double().numpy(), strict=True):
-        if item.pair.depth_wanted:
-            shape = _frame_shape(recording, (values.shape[0], values.shape[1]))
-            maps.write(int(recording.frame_t_ns[item.pair.i]), values, shape)
-
-
-def _frame_shape(recording: Recording, otherwise: tuple[int, int]) -> tuple[int, int]:
-    camera = recording.calibration.camera
-    return otherwise if camera is None else (camera.height, camera.width)
 
 
 def _version() -> str:

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 import torch
 
@@ -66,4 +66,22 @@ class Predictor(Protocol):
             frames_i: (B, 3, H, W) float32 in 0..1, channels R, G, B; on the CPU.
             frames_j: (B, 3, H, W) the later frames.
             imu_windows: (B, n, 6) float32, gyro [rad/s] then specific force [m/s²], centred at frames i.
+        """
+
+
+@runtime_checkable
+class JudgesDepth(Protocol):
+    """A `Predictor` that also says how wrong its depth is; asked only when depth maps are written."""
+
+    @property
+    def depth_uncertainty_card(self) -> Mapping[str, Any] | None:
+        """None where it cannot say. Otherwise `interval_95` (half-width over sd, at the image's own scale),
+        `common_log_sd` (of a whole image at the prior scale) and `prior_interval_95` (over both together)."""
+
+    def log_depth_sd(self, frames: torch.Tensor, z_depth: torch.Tensor) -> torch.Tensor | None:
+        """Standard deviation (B, h, w) of ln depth, pixel by pixel, once an image's scale is right.
+
+        Args:
+            frames: (B, 3, H, W) float32 in 0..1.
+            z_depth: (B, h, w) what `predict` said of them.
         """

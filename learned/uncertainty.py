@@ -74,7 +74,7 @@ class UncertaintyModel:
 
     def _design(self, signals: Array, names: Sequence[str]) -> Array:
         chosen = np.asarray(signals, float)[:, [list(names).index(name) for name in self.signals]]
-        return _design(chosen, self.mean, self.sd)
+        return standardised(chosen, self.mean, self.sd)
 
 
 def uncertainty_from_dict(values: Mapping[str, Any]) -> UncertaintyModel:
@@ -101,10 +101,10 @@ def fit_uncertainty(errors: Array, signals: Array, names: Sequence[str], chosen:
     """
     columns = np.asarray(signals, float)[:, [list(names).index(name) for name in chosen]]
     mean, sd = columns.mean(axis=0), np.maximum(columns.std(axis=0), 1e-6)
-    design = _design(columns, mean, sd)
+    design = standardised(columns, mean, sd)
     log_sd = np.zeros((6, design.shape[1]))
     for group in GROUPS:
-        log_sd[list(group)] = _fit_log_sd(np.abs(errors[:, list(group)]), design)
+        log_sd[list(group)] = fit_log_sd(np.abs(errors[:, list(group)]), design)
     scaled = errors / np.exp(design @ log_sd.T)
     second = scaled.T @ scaled / len(scaled)
     root = np.sqrt(np.maximum(np.diag(second), 1e-12))
@@ -147,13 +147,19 @@ def motion_nees(errors: Array, cov: Array) -> Array:
     return np.asarray(np.einsum("ni,ni->n", errors, np.linalg.solve(cov, errors[:, :, None])[:, :, 0]) / 6)
 
 
-def _design(columns: Array, mean: Array, sd: Array) -> Array:
+def standardised(columns: Array, mean: Array, sd: Array) -> Array:
+    """(N, 1 + S) a column of ones and the signals in standard deviations from their mean, clipped at `FARTHEST`."""
     scaled = np.clip((columns - mean) / sd, -FARTHEST, FARTHEST)
     return np.column_stack([np.ones(len(columns)), scaled])
 
 
-def _fit_log_sd(sizes: Array, design: Array) -> Array:
-    """Coefficients w that maximise Σ -w·x - ½ e² exp(-2 w·x) over errors (N, k) of a group; a convex problem."""
+def fit_log_sd(sizes: Array, design: Array) -> Array:
+    """Coefficients (S,) of ln sd, the w that maximise Σ -w·x - ½ e² exp(-2 w·x); a convex problem.
+
+    Args:
+        sizes: (N, k) absolute errors that share one sd per row.
+        design: (N, S) rows x, the first column ones.
+    """
     square = (sizes**2).mean(axis=1)
     start = np.zeros(design.shape[1])
     start[0] = 0.5 * np.log(square.mean() + 1e-18)

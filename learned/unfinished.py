@@ -2,7 +2,7 @@
 
     DIR/prediction.json   what is predicted, from what, with what; another question empties the folder
     DIR/00000.npz …       measured pairs, a part at a time
-    DIR/depth/            depth maps of those parts
+    DIR/data/, DIR/sd/    depth maps of those parts, in folders named as in a folder of depth maps
 """
 
 from __future__ import annotations
@@ -85,8 +85,8 @@ class Unfinished:
         self._count = len(parts)
         return parts
 
-    def keep(self, part: Part, maps_at: Path | None) -> None:
-        """Write one more part, and keep its depth maps, which lie in `maps_at`.
+    def keep(self, part: Part, maps_at: Sequence[Path]) -> None:
+        """Write one more part, and keep its depth maps, which lie in the folders `maps_at`.
 
         Raises:
             OutputError: the disk is full, or the folder cannot be written.
@@ -94,8 +94,8 @@ class Unfinished:
         if self._count == 0:
             with atomic_write(self.folder / QUESTION) as file:
                 file.write(self._question.encode())
-        if maps_at is not None:
-            _link_all(part.maps, maps_at, self.folder / "depth")
+        for folder in maps_at:
+            _link_all(part.maps, folder, self.folder / folder.name)
         arrays: dict[str, Any] = {"about": np.array(json.dumps({
             "pairs_passed": part.pairs_passed, "batches": len(part.measured), "maps": part.maps,
             "unreadable": {str(k): reason for k, reason in part.unreadable.items()}}))}
@@ -105,10 +105,11 @@ class Unfinished:
             np.savez(file, **arrays)
         self._count += 1
 
-    def restore_maps(self, parts: Sequence[Part], maps_at: Path) -> None:
-        """Put the depth maps of kept parts where the finished folder is being filled."""
+    def restore_maps(self, parts: Sequence[Part], maps_at: Sequence[Path]) -> None:
+        """Put the depth maps of kept parts where the finished folders are being filled."""
         for part in parts:
-            _link_all(part.maps, self.folder / "depth", maps_at)
+            for folder in maps_at:
+                _link_all(part.maps, self.folder / folder.name, folder)
 
     def discard(self) -> None:
         """Remove the folder: the prediction is finished."""

@@ -65,6 +65,32 @@ def save_weights(path: str | Path, method: Method, card: Mapping[str, Any], half
     return digest
 
 
+def rewrite_card(source: str | Path, path: str | Path, more: Mapping[str, Any]) -> dict[str, Any]:
+    """The weights of a file under a card that says more; tensors and digest stay as they are. Atomic, also in place.
+
+    Args:
+        source: weights that `load_weights` accepts.
+        path: where they are written, may be `source`.
+        more: keys to add or to replace; not `schema`, `method` or `sha256`.
+
+    Returns:
+        The whole card.
+
+    Raises:
+        WeightsError: as `load_weights`, or a key that describes the tensors.
+        OutputError: the file cannot be written.
+    """
+    fixed = sorted({"schema", "method", "sha256"} & set(more))
+    if fixed:
+        raise WeightsError(f"weights {Path(path).name}: the card's {fixed[0]} describes the tensors and cannot be "
+                           "replaced; save the weights anew")
+    card = {**load_weights(source).card, **more}
+    tensors, _ = _read(Path(source))
+    with atomic_write(path) as file:
+        file.write(save(tensors, {"card": json.dumps(card, sort_keys=True)}))
+    return card
+
+
 def load_weights(path: str | Path | None = None) -> Weights:
     """Weights from a file, or those that come with the library.
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -18,7 +18,11 @@ from vio.tracks import Tracks
 
 Array = NDArray[np.float64]
 Bools = NDArray[np.bool_]
+Ints = NDArray[np.int64]
 Depth = Callable[[int], NDArray[np.float32] | None]
+
+PAIRS_AT_ONCE = 256
+"""Pairs of frames that are fitted together."""
 
 
 @dataclass(frozen=True)
@@ -54,25 +58,71 @@ def measure_motions_with_depth(recording: Recording, depth_m: Depth | None = Non
         raise TrackingError(f"recording {recording.name}: motion from depth needs the camera's intrinsics")
     noise, depth_m = noise or DepthNoise(), depth_m or recording.depth_m
     tracks = tracks or track_recording(recording)
-    cloud, known = _points(tracks, camera, depth_m)
-    pairs = _paired(tracks, cloud, known)
-    too_few = TrackingError(f"recording {recording.name}: no two of {len(recording)} frames share three points with "
+    fits = fit_pairs(tracks, camera, depth_m, noise)
+    if len(fits.frame) == 0:
+        raise TrackingError(f"recording {recording.name}: no two of {len(recording)} frames share three points with "
                             "depth that determine a motion; is there depth, and texture?")
-    if pairs.valid.sum(axis=1).max(initial=0) < LEAST_POINTS:
-        raise too_few
-    fit = fit_rigid(pairs.first, pairs.second, valid=pairs.valid, information=_information(pairs, camera, noise))
-    k = np.flatnonzero(fit.observable)
-    if len(k) == 0:
-        raise too_few
+    k = fits.frame
     t = recording.frame_t_s
-    return RelativeMotions(t[k], t[k + 1], fit.T_i_j[k], fit.cov[k], 0.0, noise.scale_log_sd,
+    return RelativeMotions(t[k], t[k + 1], fits.T_i_j, fits.cov, 0.0, noise.scale_log_sd,
                            meta={"method": "classical: tracks and depth, 3D-3D"})
+
+
+@dataclass(frozen=True)
+class PairFits:
+    """Motions of N neighbouring pairs of frames whose points determine them."""
+
+    frame: Ints
+    """(N,) the earlier frame."""
+    T_i_j: Array
+    """(N, 4, 4) pose of the camera at the later frame in the camera at the earlier, in the depth's unit."""
+    cov: Array
+    """(N, 6, 6) right perturbation, rotation first."""
+    points: Ints
+    """(N,) that both frames see."""
+    middle: Array
+    """(N,) their median distance from the earlier camera."""
+
+
+@dataclass(frozen=True)
+class Sightings:
+    """S sightings of a point with depth in a frame and the next, in order of the frames."""
+
+    frame: Ints
+    """(S,) the earlier frame."""
+    row_i: Ints
+    """(S,) row of the tracks in it."""
+    row_j: Ints
+    """(S,) row of the tracks in the next."""
+    cloud: Array
+    """(O, 3) points of all rows of the tracks, in the axes of their camera; 0 where depth is unknown."""
+
+
+def fit_pairs(tracks: Tracks, camera: Camera, depth_m: Depth, noise: DepthNoise) -> PairFits:
+    """Motions between neighbouring frames from tracks with depth; what `measure_motions_with_depth` is made of.
+
+    Args:
+        tracks: of frames 0 to M - 1.
+        camera: that saw them.
+        depth_m: z-depth (H, W) of frame k in the camera's size, 0 or not finite where unknown; None = no depth at all.
+            Asked once for every frame, in order.
+        noise: of tracks and depth.
+    """
+    seen = shared_sightings(tracks, camera, depth_m)
+    fits = [_fitted(pairs, camera, noise) for pairs in _blocks(seen, tracks.n_frames - 1)]
+    if not fits:
+        nothing = np.zeros(0, np.int64)
+        return PairFits(nothing, np.zeros((0, 4, 4)), np.zeros((0, 6, 6)), nothing, np.zeros(0))
+    return PairFits(*(np.concatenate([getattr(fit, name) for fit in fits])
+                      for name in ("frame", "T_i_j", "cov", "points", "middle")))
 
 
 @dataclass(frozen=True)
 class _Pairs:
     """Points of N neighbouring pairs of frames, padded to P."""
 
+    index: Ints
+    """(N,) the earlier frame of each."""
     first: Array
     second: Array
     valid: Bools
@@ -83,11 +133,12 @@ def _points(tracks: Tracks, camera: Camera, depth_m: Depth) -> tuple[Array, Bool
     rays = camera.unproject(tracks.pixel)
     z = np.zeros(len(tracks))
     column, row = np.round(tracks.pixel).astype(int).T
+    begin = np.searchsorted(tracks.frame, np.arange(tracks.n_frames + 1))
     for k in range(tracks.n_frames):
         depth = depth_m(k)
         if depth is None:
             continue
-        rows = np.flatnonzero(tracks.frame == k)
+        rows = slice(begin[k], begin[k + 1])
         y, x = np.clip(row[rows], 0, depth.shape[0] - 1), np.clip(column[rows], 0, depth.shape[1] - 1)
         z[rows] = depth[y, x]
     known = np.isfinite(z) & (z > 0) & np.isfinite(rays).all(axis=1) & (rays[:, 2] > 1e-3)
@@ -95,22 +146,38 @@ def _points(tracks: Tracks, camera: Camera, depth_m: Depth) -> tuple[Array, Bool
     return np.nan_to_num(rays) * np.where(known, z / forward, 0.0)[:, None], known
 
 
-def _paired(tracks: Tracks, cloud: Array, known: Bools) -> _Pairs:
-    """Points that neighbouring frames share, one row per pair of frames."""
-    first_rows, second_rows = [], []
-    begin = np.searchsorted(tracks.frame, np.arange(tracks.n_frames + 1))
-    for k in range(tracks.n_frames - 1):
-        a, b = np.arange(begin[k], begin[k + 1]), np.arange(begin[k + 1], begin[k + 2])
-        a, b = a[known[a]], b[known[b]]
-        _, i, j = np.intersect1d(tracks.track[a], tracks.track[b], assume_unique=True, return_indices=True)
-        first_rows.append(a[i])
-        second_rows.append(b[j])
-    widest = max((len(rows) for rows in first_rows), default=0)
-    shape = (len(first_rows), max(widest, 1))
-    first, second, valid = np.zeros((*shape, 3)), np.zeros((*shape, 3)), np.zeros(shape, bool)
-    for k, (i, j) in enumerate(zip(first_rows, second_rows, strict=True)):
-        first[k, : len(i)], second[k, : len(j)], valid[k, : len(i)] = cloud[i], cloud[j], True
-    return _Pairs(first, second, valid)
+def shared_sightings(tracks: Tracks, camera: Camera, depth_m: Depth) -> Sightings:
+    """Points with depth that neighbouring frames share; arguments as of `fit_pairs`."""
+    cloud, known = _points(tracks, camera, depth_m)
+    first = int(tracks.track.min(initial=0))
+    span = int(tracks.track.max(initial=0)) - first + 1
+    key = tracks.frame * span + tracks.track - first  # rows are sorted by frame and track, so keys increase
+    row_j = np.minimum(np.searchsorted(key, key + span), max(len(key) - 1, 0))
+    row_i = np.flatnonzero((key[row_j] == key + span) & known & known[row_j])
+    return Sightings(tracks.frame[row_i], row_i, row_j[row_i], cloud)
+
+
+def _blocks(seen: Sightings, n_pairs: int) -> Iterator[_Pairs]:
+    """Pairs with enough points, a bounded number at a time: a fit's memory does not grow with the recording."""
+    count = np.bincount(seen.frame, minlength=n_pairs)
+    begin = np.concatenate([[0], np.cumsum(count)])
+    enough = np.flatnonzero(count >= LEAST_POINTS)
+    for start in range(0, len(enough), PAIRS_AT_ONCE):
+        index = enough[start : start + PAIRS_AT_ONCE]
+        column = np.arange(count[index].max())
+        valid = column < count[index, None]
+        rows = np.where(valid, begin[index, None] + column, 0)
+        first, second = (seen.cloud[side[rows]] for side in (seen.row_i, seen.row_j))
+        yield _Pairs(index, first, second, valid)
+
+
+def _fitted(pairs: _Pairs, camera: Camera, noise: DepthNoise) -> PairFits:
+    """Those pairs of a block whose motion is determined."""
+    fit = fit_rigid(pairs.first, pairs.second, valid=pairs.valid, information=_information(pairs, camera, noise))
+    distance = np.where(pairs.valid, np.linalg.norm(pairs.first, axis=2), np.nan)
+    good = fit.observable
+    return PairFits(pairs.index[good], fit.T_i_j[good], fit.cov[good], pairs.valid[good].sum(axis=1),
+                    np.nanmedian(distance[good], axis=1))
 
 
 def _information(pairs: _Pairs, camera: Camera, noise: DepthNoise) -> Array:

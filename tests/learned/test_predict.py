@@ -207,7 +207,7 @@ def test_a_batch_too_large_for_the_accelerator_is_halved_and_said(recording: Rec
 @pytest.mark.parametrize("stopped_at", [0, 5, 9])
 def test_a_stopped_prediction_goes_on_to_the_same_bytes(recording: Recording, tmp_path: Path, monkeypatch,
                                                         stopped_at: int) -> None:
-    monkeypatch.setattr(sys.modules["learned.predict"], "PAIRS_KEPT", 4)
+    monkeypatch.setattr(sys.modules["learned.prediction_run"], "PAIRS_KEPT", 4)
     recording.frame_paths[3].write_bytes(b"")
 
     def predicted(name: str, predictor: BarShift) -> learned.Prediction:
@@ -232,7 +232,7 @@ def test_a_stopped_prediction_goes_on_to_the_same_bytes(recording: Recording, tm
 
 def test_another_question_is_not_answered_from_what_was_kept(recording: Recording, tmp_path: Path,
                                                              monkeypatch) -> None:
-    monkeypatch.setattr(sys.modules["learned.predict"], "PAIRS_KEPT", 2)
+    monkeypatch.setattr(sys.modules["learned.prediction_run"], "PAIRS_KEPT", 2)
     unfinished = tmp_path / "unfinished"
     with pytest.raises(learned.PredictionError):
         learned.predict(recording, BarShift(break_at=7), batch_size=2, unfinished=unfinished)

@@ -5,10 +5,10 @@ import dataclasses
 import numpy as np
 import pytest
 
-from vio import se3
+from vio import depth_odometry, se3
 from vio.calibration import Calibration
 from vio.camera import Camera
-from vio.depth_odometry import DepthNoise, measure_motions_with_depth
+from vio.depth_odometry import DepthNoise, fit_pairs, measure_motions_with_depth
 from vio.errors import TrackingError
 from vio.imu import ImuNoise, ImuSamples
 from vio.odometry import measure_motions, measure_recording
@@ -182,3 +182,20 @@ def test_motion_from_depth_needs_depth_and_a_camera():
         measure_motions_with_depth(blind, lambda k: None, tracks=tracks)
     with pytest.raises(TrackingError, match="image"):
         measure_recording(blind)
+
+
+def test_pairs_are_those_that_a_plain_search_finds_in_any_block(monkeypatch):
+    T, seed = poses(7, 9), 7
+    tracks = observed(T, PINHOLE, seed)
+    keep = np.random.default_rng(7).random(len(tracks)) < 0.8
+    keep &= tracks.frame != 4  # nothing seen in one frame: two pairs fall out
+    tracks = dataclasses.replace(tracks, frame=tracks.frame[keep], track=tracks.track[keep], pixel=tracks.pixel[keep])
+    depth = depth_at_tracks(T, tracks, seed, 0.0)
+    whole = fit_pairs(tracks, PINHOLE, depth, DepthNoise())
+    assert whole.frame.tolist() == [0, 1, 2, 5, 6, 7]
+    rows = [set(tracks.track[tracks.frame == k]) for k in range(9)]
+    assert whole.points.tolist() == [len(rows[k] & rows[k + 1]) for k in whole.frame]
+    monkeypatch.setattr(depth_odometry, "PAIRS_AT_ONCE", 2)
+    parts = fit_pairs(tracks, PINHOLE, depth, DepthNoise())
+    np.testing.assert_allclose(parts.T_i_j, whole.T_i_j, atol=1e-12)
+    np.testing.assert_allclose(parts.cov, whole.cov, rtol=1e-6)
