@@ -52,7 +52,9 @@ class ChainEngine:
         factor = begin.model.linearize(begin.values, term).factor()
         cov, joint = factor.marginals_and_samples(rng)
         variance = np.zeros(0)
-        if segments is not None:
+        if segments is None:  # the band's unknowns of scale mean nothing then
+            joint = replace(joint, log_scale=np.zeros_like(joint.log_scale))
+        else:
             begins = np.flatnonzero(np.diff(segments.of_node, prepend=-1))
             variance = cov[begins, 0, 0]
         return Uncertainty(np.ascontiguousarray(cov[:, POSE, POSE]), variance, joint)
