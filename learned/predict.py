@@ -138,8 +138,13 @@ def _question(recording: Recording, predictor: Predictor, batch_size: int, maps:
     """All that decides what is measured."""
     return {"images": images_digest(recording), "predictor": dict(predictor.card), "batch_size": batch_size,
             "baselines": list(predictor.baselines), "depth_unit_m": None if maps is None else maps.unit_m,
-            "with_sd": maps is not None and maps.with_sd,
+            "depth_sd": None if maps is None or not isinstance(predictor, JudgesDepth) else _judging(predictor),
             "library_version": _version()}
+
+
+def _judging(predictor: JudgesDepth) -> dict[str, Any] | None:
+    card = predictor.depth_uncertainty_card
+    return None if card is None else dict(card)
 
 
 def _joined(done: list[MeasuredPairs], recording: Recording, unreadable: dict[int, str],

@@ -1,6 +1,7 @@
 """Standard deviations of predicted depth: right where the truth is known, honest on disk, and absent where unknown."""
 
 import json
+import sys
 from dataclasses import replace
 
 import cv2
@@ -187,6 +188,28 @@ def test_a_predictor_that_breaks_its_word_about_depth_leaves_nothing(file, ball,
     with pytest.raises(learned.PredictionError, match="log_depth_sd of frames 0 to 7"):
         learned.predict(ball, broken, depth_dir=tmp_path / "d")
     assert not (tmp_path / "d").exists()
+
+
+def test_sd_maps_survive_an_interruption(file, ball, tmp_path, monkeypatch):
+    monkeypatch.setattr(sys.modules["learned.prediction_run"], "PAIRS_KEPT", 4)  # the name is the function's too
+    whole = predictor_for(ball, load_weights(file))
+    calls = []
+
+    class Stopped(NetworkPredictor):
+        def log_depth_sd(self, frames, z_depth):
+            calls.append(len(frames))
+            if len(calls) == 3:
+                raise KeyboardInterrupt
+            return super().log_depth_sd(frames, z_depth)
+    stopped = Stopped(**{name: getattr(whole, name) for name in whole.__dataclass_fields__})
+    options = {"batch_size": 4, "unfinished": tmp_path / "unfinished"}
+    with pytest.raises(KeyboardInterrupt):
+        learned.predict(ball, stopped, depth_dir=tmp_path / "d", **options)
+    again = learned.predict(ball, stopped, depth_dir=tmp_path / "d", **options)
+    assert len(calls) == 5  # two batches were kept
+    once = learned.predict(ball, whole, depth_dir=tmp_path / "once", batch_size=4)
+    for name in ("depth", "depth_sd"):
+        assert [f.read_bytes() for f in getattr(again, name)] == [f.read_bytes() for f in getattr(once, name)]
 
 
 def test_a_card_is_extended_without_touching_the_weights(file, ball, tmp_path):
