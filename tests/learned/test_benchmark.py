@@ -113,6 +113,9 @@ def test_a_table_from_the_command_line(finished, data, capsys):
     assert table["lines"][0]["snr"] is None and all(value > 1 for value in table["lines"][1]["snr"].values())
     assert set(table["manifest"]["data"]["sha256"]) == {
         f"{kind}/{part}" for kind in KINDS for part in ("train/00", "test/00", "test/01", "test/02")}
+    better = sum(line["means"]["abs_rel"] < guessed["means"]["abs_rel"]
+                 for line, guessed in zip(table["lines"], np.repeat(table["guesses"], 2), strict=True))
+    assert f"AbsRel: {better} of 4 variants beat the same depth everywhere." in table["verdicts"]
     page = (finished / "vibration-types.md").read_text()
     assert "not who wins" in page and "One seed" in page and str(data.parent) not in page + json.dumps(table)
     assert not list((finished / "training").rglob("checkpoint.pt"))
