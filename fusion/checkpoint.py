@@ -50,6 +50,7 @@ def refinement_key(recording: Recording, motions: RelativeMotions, config: Refin
               calibration.T_body_camera, motions.t_i_s, motions.t_j_s, motions.T_i_j, motions.cov)
     facts = {"config": config.to_dict(), "imu_noise": asdict(calibration.imu_noise), "name": recording.name,
              "time_offset_s": calibration.time_offset_s, "scale": [motions.scale_log_mean, motions.scale_log_sd],
+             "motions_meta": motions.meta,
              "libraries": {name: _version(name) for name in ("capsule-vio", "numpy", "scipy", "gtsam")}}
     return digest([json.dumps(facts, sort_keys=True).encode(), *(np.ascontiguousarray(a).tobytes() for a in arrays)])
 

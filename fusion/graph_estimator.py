@@ -107,6 +107,8 @@ class GraphEstimator:
         with self.stages("fixed_scale"):
             fixed = self._fixed_pass(start, start_scale)
         final, conclusion, inflation = self._decide(fixed, start_scale)
+        if final.term.segment is not None:
+            conclusion = scale_policy.with_gain(conclusion, self.problem.scale_gain_sd)
         return final, conclusion, fixed.imu_chi2, inflation
 
     def _check_solvable(self) -> None:

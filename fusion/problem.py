@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from fusion.scaled_motion import ScaledMotions, make_motions
 from fusion.vibration import vibration_inflation
 from vio import se3
+from vio.errors import MotionsError
 from vio.imu import Gap, ImuNoise, ImuPieces, ImuSamples, find_gaps, preintegrate_rotation, split_at_frames
 from vio.imu_checks import check_imu, saturated_samples
 from vio.motions import RelativeMotions, match_frames
@@ -57,6 +58,8 @@ class Problem:
     """What `pieces` were cut from, whole recording."""
     imu_t_s: Array
     """(S,) their stamps on the frames' clock."""
+    scale_gain_sd: float = 0.0
+    """How far the motions' single steps may be scaled otherwise than the path, in log (`meta` of the motions)."""
     motion_noise: tuple[float, float] = (1.0, 1.0)
     """Factors on the noise of rotation and translation that the motions claimed; already in `motions`."""
 
@@ -97,8 +100,18 @@ def build_problem(recording: Recording, motions: RelativeMotions) -> Problem:
         accel_inflation=holes * clipped[1] * accel_inflation, gyro_inflation=holes * clipped[0] * gyro_inflation,
         motions=batch,
         scale_log_mean=motions.scale_log_mean, scale_log_sd=motions.scale_log_sd, noise=noise,
-        gyro_bias_rad_s=gyro_bias, samples=recording.imu, imu_t_s=imu_t,
+        gyro_bias_rad_s=gyro_bias, samples=recording.imu, imu_t_s=imu_t, scale_gain_sd=_scale_gain_sd(motions),
     )
+
+
+def _scale_gain_sd(motions: RelativeMotions) -> float:
+    """What the source says of itself; the largest of several."""
+    sources = [motions.meta, *motions.meta.get("sources", [])]
+    given = [meta["scale_gain_sd"] for meta in sources if "scale_gain_sd" in meta]
+    if not all(isinstance(sd, (int, float)) and 0 <= sd < np.inf for sd in given):
+        raise MotionsError(f"motions: meta scale_gain_sd is {given[0]!r}; give a standard deviation of the log scale, "
+                           "0 or more")
+    return float(max(given, default=0.0))
 
 
 def with_accelerometer(problem: Problem, accel_m_s2: Array) -> Problem:

@@ -138,6 +138,15 @@ def widened(conclusion: ScaleConclusion, motion: BodyMotion, remedy: Remedy) -> 
     return replace(conclusion, log_sd=float(np.hypot(conclusion.log_sd, extra)), assumed_sd=extra)
 
 
+def with_gain(conclusion: ScaleConclusion, gain_sd: float) -> ScaleConclusion:
+    """The conclusion for a source whose single steps, which the IMU measures, are scaled otherwise than its path."""
+    if gain_sd == 0:
+        return conclusion
+    reason = f"{conclusion.reason}; {gain_sd:.2f} in log added, for the source scales quick motion otherwise than slow"
+    return replace(conclusion, log_sd=float(np.hypot(conclusion.log_sd, gain_sd)), reason=reason,
+                   assumed_sd=float(np.hypot(conclusion.assumed_sd, gain_sd)))
+
+
 def assumed_sd(problem: Problem, config: ScaleConfig) -> float:
     """Sd of the recording's mean log scale where it is not measured: the prior's, and the walk away from it.
 

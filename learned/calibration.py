@@ -20,6 +20,7 @@ from learned.errors import TrainingError, WeightsError
 from learned.evaluation import angle_deg, depth_score, motion_score, nees_of
 from learned.inference import SIGNALS
 from learned.measured import Measured, measure
+from learned.scale_gain import scale_gain_sd
 from learned.train_config import train_config_to_dict
 from learned.training import TrainedRun
 from learned.uncertainty import UncertaintyModel, choose_signals, fit_uncertainty, uncertainty_from_dict
@@ -104,6 +105,7 @@ def calibrated(measured: Sequence[Measured]) -> dict[str, Any]:
         **depth_sections(used, model, float(np.mean(scales))),
         "scale_log_mean": float(np.mean(scales)), "scale_log_sd": max(spread, LEAST_SCALE_SD),
         "uncertainty": model.to_dict(),
+        "scale_gain_sd": scale_gain_sd(used),
         # Root mean square per axis: noise, and the bias that nobody has removed.
         "gyro_sd_rad": float(np.sqrt(np.mean(np.concatenate(gyro) ** 2) / 3)) if gyro else None,
         "calibration": {"pairs": pairs, "recordings": len(used), "nees": float(nees_of(used, model, SIGNALS).mean()),

@@ -68,6 +68,12 @@ class NetworkPredictor:
         return float(self.weights.card["scale_log_sd"])
 
     @property
+    def scale_gain_sd(self) -> float | None:
+        """How far the scale of single steps is off that of the path, in log; None from cards that do not say."""
+        value = self.weights.card.get("scale_gain_sd")
+        return None if value is None else float(value)
+
+    @property
     def card(self) -> Mapping[str, Any]:
         """Method, digest and origin of the weights."""
         card = self.weights.card

@@ -288,3 +288,17 @@ def test_without_any_usable_imu_the_motions_still_lead(examination):
     assert refined.estimator in ("ekf", "motions")
     assert refined.fallback_reason.startswith("graph: no frame interval has usable IMU data")
     assert ate(refined.trajectory, refined.truth).rmse_m < 1.5 * ate(refined.motions_only, refined.truth).rmse_m
+
+
+def test_a_source_that_scales_quick_motion_otherwise_is_believed_less(examination, refined):
+    """It widens scale, path and pose; it changes no estimate."""
+    motions = replace(examination.motions, meta={"scale_gain_sd": 0.2})
+    wide = refine(examination.recording, motions)
+    assert wide.scale.policy == refined.scale.policy and "quick motion" in wide.scale.reason
+    assert wide.scale.log_sd == pytest.approx(np.hypot(refined.scale.log_sd, 0.2))
+    np.testing.assert_allclose(wide.trajectory.T_world_body, refined.trajectory.T_world_body, atol=1e-12)
+    assert wide.trajectory.cov[-1, 3:, 3:].trace() > 2 * refined.trajectory.cov[-1, 3:, 3:].trace()
+    assert wide.joint.log_scale[:, 5].std() == pytest.approx(wide.log_scale_sd[5], rel=0.1)
+    for wrong in (-0.1, "0.2", float("nan")):
+        with pytest.raises(MotionsError, match="scale_gain_sd"):
+            refine(examination.recording, replace(examination.motions, meta={"scale_gain_sd": wrong}))
