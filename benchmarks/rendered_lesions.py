@@ -149,7 +149,7 @@ def shows(depth_of: Callable[[int], np.ndarray], frame: int, pixel: np.ndarray, 
     return there > 0 and abs(there / depth_m - 1) < SAME_DEPTH
 
 
-TEXT = """{duration:g} s at 3 Hz per recording, {seeds} seeds ({first}-{last}) that nothing was trained or chosen on, in
+TEXT = """{duration:g} s at 3 Hz per recording, {seeds} seeds ({first}-{last}) that nothing was trained on, in
 colon and small bowel, driven ("operated"), rendered at {size} x {size} pixels through two cameras, with vibrations
 from none to collisions of level 5. Motions and depth are those of the bundled network; pixels are exact, truth comes
 from the rendered depth. Each lesion is a random spot of the wall or one of the simulator's marks, noted in up to five
@@ -164,7 +164,7 @@ correlated: {recordings} recordings are few.
 
 {judgement}
 
-Why: the refined scale is {scale:.0f} % off in the median (worst {scale_worst:.0f} %) where it claims a standard
+The refined scale is {scale:.0f} % off in the median (worst {scale_worst:.0f} %) where it claims a standard
 deviation of {claimed:.0f} %, and arc length is proportional to scale. On the same recordings the network's own prior,
 which claims much more, holds."""
 AIM = (90.0, 99.0)
