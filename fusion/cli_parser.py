@@ -202,8 +202,9 @@ def _locate(commands: Commands) -> None:
     parser.add_argument("--recording", type=Path, metavar="REC", help="the recording: its own depth maps")
     parser.add_argument("--between", nargs=2, metavar="LABEL", help="landmarks that percentages refer to (default: "
                         "pylorus and ileocecal valve; without either, the first and the last landmark)")
-    parser.add_argument("--depth-sd", type=float, default=0.1, metavar="SHARE",
-                        help="standard deviation of a depth as a share of it (default: 0.1)")
+    parser.add_argument("--depth-sd", type=float, metavar="SHARE",
+                        help="standard deviation of a depth as a share of it (default: the sd maps beside predicted "
+                        "depth, 0.1 where there are none)")
     parser.add_argument("--video", metavar="ID", help="which video_id of a Kvasir-Capsule file")
     parser.add_argument("--out", type=Path, metavar="DIR", help="where lesions.csv and lesions.json go (default: RUN)")
     _json(parser)

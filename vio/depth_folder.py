@@ -8,14 +8,16 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from vio.calibration import load_yaml, number
 from vio.depth import DepthEncoding, LinearDepth
-from vio.errors import FormatError
+from vio.errors import CalibrationError, FormatError
 from vio.formats.asl import read_depth_listing
 from vio.image_files import decode_image
 from vio.recording import Recording
 
 PREDICTION = "prediction.json"
 """Marks maps that a network predicted, one for every frame, metric at the prior scale."""
+SD_FOLDER, SD_UNIT_KEY = "sd", "log_depth_sd_unit"
 NS = 1e-9
 
 
@@ -33,6 +35,8 @@ class DepthFolder:
     """Metric at the prior scale of the predictor, not measured."""
     start_ns: int
     """Stamp of the recording's first frame."""
+    log_sd_unit: float | None = None
+    """Sd of ln depth per count of the maps in `sd/` beside; None where there are none."""
 
     def depth_m(self, t_s: float) -> NDArray[np.float32] | None:
         """z-depth (H, W) [m] of the frame at a time after the first frame, 0 where unknown; None when not mapped.
@@ -40,12 +44,29 @@ class DepthFolder:
         Raises:
             RecordingError: the map is absent, cut off, undecodable, not of its declared kind, or of unknown scale.
         """
-        off = np.abs((self.t_ns - self.start_ns) * NS - t_s)
-        k = int(np.argmin(off))
-        if off[k] > 1e-3:
+        file = self._file(t_s)
+        if file is None:
             return None
         what = f"{self.name}: depth at {t_s:.3f} s"
-        return self.encoding.depth_m(decode_image(self.files[k], what, depth=True), what)
+        return self.encoding.depth_m(decode_image(file, what, depth=True), what)
+
+    def log_sd(self, t_s: float) -> NDArray[np.float32] | None:
+        """Sd (H, W) of ln depth of the frame at a time, 0 where depth is unknown; None where nothing says.
+
+        Raises:
+            RecordingError: the map is absent, cut off or undecodable.
+        """
+        file = self._file(t_s)
+        if file is None or self.log_sd_unit is None:
+            return None
+        counts = decode_image(file.parent.parent / SD_FOLDER / file.name, f"{self.name}: sd of depth at {t_s:.3f} s",
+                              depth=True)
+        return np.asarray(counts, np.float32) * np.float32(self.log_sd_unit)
+
+    def _file(self, t_s: float) -> Path | None:
+        off = np.abs((self.t_ns - self.start_ns) * NS - t_s)
+        k = int(np.argmin(off))
+        return self.files[k] if off[k] <= 1e-3 else None
 
 
 def read_depth_folder(folder: str | Path, recording: Recording | None = None) -> DepthFolder:
@@ -69,4 +90,15 @@ def read_depth_folder(folder: str | Path, recording: Recording | None = None) ->
         raise FormatError(f"{folder.name}: no {PREDICTION}, so the first map need not be the first frame's; name the "
                           "recording too")
     start_ns = int(t_ns[0]) if recording is None else int(recording.frame_t_ns[0])
-    return DepthFolder(folder.resolve().name, t_ns, files, encoding or LinearDepth(unit_m), predicted, start_ns)
+    return DepthFolder(folder.resolve().name, t_ns, files, encoding or LinearDepth(unit_m), predicted, start_ns,
+                       _log_sd_unit(folder))
+
+
+def _log_sd_unit(folder: Path) -> float | None:
+    sensor = load_yaml(folder / "sensor.yaml")
+    if SD_UNIT_KEY not in sensor or not (folder / SD_FOLDER).is_dir():
+        return None
+    unit = number(sensor, SD_UNIT_KEY, "sensor.yaml")
+    if not 0 < unit < 1:
+        raise CalibrationError(f"sensor.yaml: {SD_UNIT_KEY} is {unit:g}; must be between 0 and 1, such as 1e-4")
+    return unit

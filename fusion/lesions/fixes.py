@@ -37,6 +37,8 @@ PATCH = 2
 """Depth is the median of the known values within so many pixels."""
 VIEW_SD_M = 20e-3
 """How far from the camera a lesion of unknown depth may be, for deciding whether two sightings are one lesion."""
+RELATIVE_SD = 0.10
+"""Standard deviation of a depth as a share of it, where nobody says otherwise."""
 NO_DEPTH = "no depth was given: position and arc length are those of the camera, the lesion lies in its view"
 
 
@@ -66,7 +68,8 @@ class DepthSource:
 
     folder: DepthFolder | None
     recording: Recording | None
-    relative_sd: float
+    relative_sd: float | None
+    """Sd of a depth as a share of it; None = what the folder's sd maps say, `RELATIVE_SD` where there are none."""
 
     @property
     def predicted(self) -> bool:
@@ -78,6 +81,14 @@ class DepthSource:
         if self.folder is not None:
             return self.folder.depth_m(t_s)
         return None if self.recording is None else self.recording.depth_m(frame)
+
+    def relative_sd_at(self, t_s: float, pixel: Array) -> float:
+        """Sd of the depth around a pixel (column, row), as a share of it."""
+        if self.relative_sd is not None:
+            return self.relative_sd
+        values = None if self.folder is None else self.folder.log_sd(t_s)
+        patch = np.zeros(0) if values is None else _patch(values, pixel)
+        return float(np.median(patch[patch > 0])) if (patch > 0).any() else RELATIVE_SD
 
 
 def place_sighting(refinement: Refinement, sighting: Sighting, index: int, view: View | None,
@@ -98,7 +109,8 @@ def place_sighting(refinement: Refinement, sighting: Sighting, index: int, view:
     R = refinement.trajectory.rotations[index]
     along = depth_m * (R_bc @ ray)
     aside = depth_m * (R_bc @ slope)
-    own = R @ (depth.relative_sd**2 * np.outer(along, along) + PIXEL_SD**2 * aside @ aside.T) @ R.T
+    relative_sd = depth.relative_sd_at(float(refinement.trajectory.t_s[index]), pixel)
+    own = R @ (relative_sd**2 * np.outer(along, along) + PIXEL_SD**2 * aside @ aside.T) @ R.T
     scaled = along if depth.predicted else np.zeros(3)
     return _fix(refinement, sighting, index, along + t_bc, scaled, own, "")
 
@@ -174,9 +186,7 @@ def _depth(refinement: Refinement, sighting: Sighting, index: int, view: View | 
     if values.shape != (camera.height, camera.width):
         raise LesionError(f"{sighting.where}: its depth map has {values.shape[1]} x {values.shape[0]} pixels but the "
                           f"camera {camera.width} x {camera.height}; give maps in the camera's resolution")
-    column, row = (int(np.clip(round(float(p)), 0, size - 1)) for p, size in
-                   zip(pixel, (camera.width, camera.height), strict=True))
-    patch = values[max(row - PATCH, 0):row + PATCH + 1, max(column - PATCH, 0):column + PATCH + 1]
+    patch = _patch(values, pixel)
     if not all(np.isfinite(part).all() for part in _ray(camera, pixel)):
         return None, "no ray of the calibrated camera meets this pixel: position and arc length are those of the camera"
     if not (patch > 0).any():
@@ -185,6 +195,13 @@ def _depth(refinement: Refinement, sighting: Sighting, index: int, view: View | 
     if depth.predicted:
         known *= float(np.exp(refinement.log_scale[index] - view.prior_log_scale))
     return known, ""
+
+
+def _patch(values: NDArray[np.float32], pixel: Array) -> NDArray[np.float32]:
+    """Values (H, W) around a pixel."""
+    column, row = (int(np.clip(round(float(p)), 0, size - 1)) for p, size in
+                   zip(pixel, values.shape[::-1], strict=True))
+    return values[max(row - PATCH, 0):row + PATCH + 1, max(column - PATCH, 0):column + PATCH + 1]
 
 
 def _ray(camera: Camera, pixel: Array) -> tuple[Array, Array]:

@@ -20,15 +20,13 @@ from vio.depth_folder import read_depth_folder
 from vio.errors import LesionError
 from vio.recording import Recording
 
-DEPTH_RELATIVE_SD = 0.10
-"""Standard deviation of a depth as a share of it, where nobody says otherwise."""
 FARTHEST_FRAME_S = 0.5
 """A time further than this (and than half the usual frame spacing) from every frame shows nothing."""
 
 
 def locate(refined: Refinement | str | Path, lesions: str | Path | Sequence[Sighting], *,
            depth: str | Path | None = None, recording: Recording | None = None, between: tuple[str, str] | None = None,
-           video: str | None = None, depth_relative_sd: float = DEPTH_RELATIVE_SD) -> LesionTable:
+           video: str | None = None, depth_relative_sd: float | None = None) -> LesionTable:
     """Place lesions on a refined trajectory, each with 95 % intervals.
 
     Args:
@@ -39,7 +37,8 @@ def locate(refined: Refinement | str | Path, lesions: str | Path | Sequence[Sigh
         between: labels of the two landmarks that percentages refer to; by default pylorus and ileocecal valve, and
             where neither was seen the first and the last landmark.
         video: which video of a Kvasir-Capsule file.
-        depth_relative_sd: standard deviation of a depth, as a share of it.
+        depth_relative_sd: standard deviation of a depth, as a share of it; None = what the sd maps beside predicted
+            depth say, 0.1 where there are none.
 
     Returns:
         One row per lesion or landmark, in order of time. What cannot be known is None, and the row's status says why.
@@ -48,7 +47,7 @@ def locate(refined: Refinement | str | Path, lesions: str | Path | Sequence[Sigh
         LesionError: the list, a frame, a time or a pixel that cannot be used, in one line.
         FormatError: no run folder, or no folder of depth maps.
     """
-    if not (np.isfinite(depth_relative_sd) and 0 < depth_relative_sd < 1):
+    if depth_relative_sd is not None and not 0 < depth_relative_sd < 1:
         raise LesionError(f"locate: the sd of depth is {depth_relative_sd}; give a share between 0 and 1, such as 0.1")
     refinement = refined if isinstance(refined, Refinement) else read_refinement(refined)
     sightings = read_sightings(lesions, video) if isinstance(lesions, (str, Path)) else list(lesions)

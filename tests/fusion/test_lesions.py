@@ -1,5 +1,6 @@
 """Lesions on a trajectory: where they are, how sure that is, and what is not known."""
 
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -14,6 +15,7 @@ from fusion.lesions.fixes import PIXEL_SD, DepthSource, place_sighting, pose_and
 from fusion.lesions.table import COLUMNS
 from vio import se3
 from vio.depth_folder import read_depth_folder
+from vio.errors import CalibrationError
 
 SD = 0.10
 
@@ -59,6 +61,27 @@ def test_covariance_to_first_order_is_what_sampling_finds(case):
     lower = np.linalg.cholesky(cov)
     white = np.linalg.solve(lower, (world - fix.point_m).T)
     np.testing.assert_allclose(white @ white.T / n, np.eye(3), atol=0.08)
+
+
+def test_sd_maps_beside_predicted_depth_are_believed(case, tmp_path):
+    lesion = case.lesions[6]
+    sighting = Sighting("x", "finding", lesion.frame, None, lesion.pixel, "x")
+    folder = tmp_path / "depth"
+    shutil.copytree(case.depth, folder)
+    given = place_sighting(case.refined, sighting, lesion.frame, case.refined.view,
+                           DepthSource(read_depth_folder(folder, case.recording), None, 0.3))
+    (folder / "sd").mkdir()
+    for file in (folder / "data").iterdir():
+        shape = cv2.imread(str(file), cv2.IMREAD_UNCHANGED).shape
+        cv2.imwrite(str(folder / "sd" / file.name), np.full(shape, 3000, np.uint16))
+    with (folder / "sensor.yaml").open("a") as sensor:
+        sensor.write("log_depth_sd_unit: 0.0001\n")
+    found = place_sighting(case.refined, sighting, lesion.frame, case.refined.view,
+                           DepthSource(read_depth_folder(folder, case.recording), None, None))
+    np.testing.assert_allclose(found.own_cov, given.own_cov, rtol=1e-5)
+    (folder / "sensor.yaml").write_text((folder / "sensor.yaml").read_text().replace("0.0001", "-1"))
+    with pytest.raises(CalibrationError, match="log_depth_sd_unit is -1"):
+        read_depth_folder(folder, case.recording)
 
 
 def test_pose_and_scale_belong_together(case):
