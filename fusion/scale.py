@@ -19,7 +19,7 @@ VAGUE_PRIOR_SD = 0.5
 """Prior sd of the log scale above which the fixed-scale pass starts from a search instead of the mean."""
 PLAUSIBLE_SDS = 4.0
 """How many prior sds the freed scale may move before it is disbelieved."""
-PLAUSIBLE_REJECTED = 0.15
+PLAUSIBLE_REJECTED = 0.4
 """Share of motions that may be gated before the freed scale is disbelieved."""
 INFORMATIVE = 0.5
 """The freed scale's sd must be below this share of the prior's to count as measured."""
