@@ -265,7 +265,8 @@ def measured(seed: int = 0, pairs: int = 6) -> Measured:
     depth = rng.uniform(0.01, 0.05, (pairs, 8, 9)).astype(np.float32)
     T = se3.exp(np.concatenate([rng.normal(0, 0.1, (pairs, 3)), rng.normal(0, 0.003, (pairs, 3))], 1))
     return Measured("one", np.zeros((pairs, 8, 9, 3), np.uint8), np.ones((8, 9), bool), depth.copy(), depth, T.copy(),
-                    T, None, np.zeros((pairs, 8)), np.full(pairs, 1 / 3))
+                    T, None, np.zeros((pairs, 8)), np.full(pairs, 1 / 3),
+                    Camera("pinhole", 9, 8, 8.0, 8.0, 4.0, 3.5, (0.0,) * 4))
 
 
 def test_scores_forgive_scale_and_nothing_else():
