@@ -168,7 +168,7 @@ def test_ate_ignores_exactly_the_freedom_its_alignment_grants(seed, noise, log_s
         assert after.rmse_m == pytest.approx(before.rmse_m, rel=1e-6, abs=1e-11)
         assert after.rotation_rmse_rad == pytest.approx(before.rotation_rmse_rad, rel=1e-6, abs=1e-11)
     rmse = [ate(estimate, reference, mode).rmse_m for mode in ("yaw4", "se3", "sim3")]
-    assert rmse == sorted(rmse, reverse=True) or np.ptp(rmse) < 1e-12
+    assert (np.diff(rmse) < 1e-6 * rmse[0] + 1e-12).all()  # more freedom, less error, but for rounding
     assert rpe(moved(estimate, free), reference, 4).rmse_m == pytest.approx(rpe(estimate, reference, 4).rmse_m,
                                                                            rel=1e-6, abs=1e-11)
 
