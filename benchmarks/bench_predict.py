@@ -19,6 +19,7 @@ from results import record, table
 
 import learned
 import vio
+from learned.camera_rays import camera_batch
 from learned.frames import resized_rgb
 from learned.inference import estimate_pairs
 from learned.network_predictor import NetworkPredictor, predictor_for
@@ -45,7 +46,8 @@ def bare_pass(recording: Recording, predictor: NetworkPredictor, batch_size: int
     def run() -> None:
         with torch.inference_mode():
             for frames, inertial in batches:
-                estimate_pairs(predictor.weights.method, frames, inertial, predictor._cameras(len(frames)),
+                cameras = camera_batch([predictor.camera]).repeated(len(frames))
+                estimate_pairs(predictor.weights.method, frames, inertial, cameras,
                                predictor.weights.card["depth_kind"])
     return run
 

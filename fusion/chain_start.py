@@ -17,7 +17,6 @@ from fusion.graph import (
     BLIND_SPEED_M_S,
     GAP_VELOCITY_SD_M_S_RTS,
     Anchor,
-    first_anchor,
     gyro_covers,
 )
 from fusion.inertial import InertialSteps, preintegrate_steps
@@ -26,17 +25,14 @@ from fusion.initialization import (
     CARRIED_POSE_SD,
     CARRIED_VELOCITY_SD,
     CHUNK_ITERATIONS,
-    chain_positions,
     chunk_spans,
-    gyro_chain,
-    level_rotation,
+    first_guess,
 )
 from fusion.preintegration import make_bias
 from fusion.problem import Problem
 from fusion.scale import imu_chi2
 from fusion.solve import MotionTerm
 from fusion.stretches import Stretch
-from vio import se3
 from vio.errors import EstimationError
 
 Array = NDArray[np.float64]
@@ -114,13 +110,7 @@ def _chunk(problem: Problem, config: RefineConfig, log_scale: float, steps: Iner
     inside = (problem.motions.i >= k0) & (problem.motions.j <= k1)
     motions = problem.motions.select(inside, first_node=k0)
     gyro_bias = problem.gyro_bias_rad_s if anchor is None else anchor.bias.gyroscope()
-    R = gyro_chain(problem, steps.rotations(gyro_bias), k0)
-    if anchor is None:
-        R = level_rotation(problem, R, k0) @ R
-        anchor = first_anchor(se3.transform(R[0], np.zeros(3)), problem.gyro_bias_rad_s, config.initial)
-    else:
-        R = anchor.T_world_body[:3, :3] @ R
-    p, v = chain_positions(problem, motions, R, anchor.T_world_body[:3, 3], log_scale, k0)
+    R, p, v, anchor = first_guess(problem, motions, steps.rotations(gyro_bias), config.initial, log_scale, k0, anchor)
     accel_bias, gyro_bias = anchor.bias.accelerometer(), anchor.bias.gyroscope()
     guess = ChainState(R, p, v, np.tile(accel_bias, (len(R), 1)), np.tile(gyro_bias, (len(R), 1)), np.zeros(0))
     term = MotionTerm(motions, None, log_scale, config.robust.huber, np.ones(len(motions)))

@@ -13,7 +13,7 @@ import numpy as np
 from gtsam.symbol_shorthand import B, V, X
 from numpy.typing import NDArray
 
-from fusion.config import RefineConfig, SolverConfig
+from fusion.config import InitialConfig, RefineConfig, SolverConfig
 from fusion.graph import Anchor, add_anchor, add_imu, first_anchor, insert_states
 from fusion.preintegration import preintegrate
 from fusion.problem import Problem
@@ -132,6 +132,28 @@ def _preintegrate(problem: Problem, bias: Array, accel_inflation: float,
                         problem.gyro_inflation, span)
 
 
+def first_guess(problem: Problem, motions: ScaledMotions, rotations: Array, initial: InitialConfig, log_scale: float,
+                k0: int, anchor: Anchor | None) -> tuple[Array, Array, Array, Anchor]:
+    """Attitudes, positions and velocities of a chunk's frames from the gyro and the motions, and what it begins from.
+
+    Args:
+        problem: the whole recording.
+        motions: those inside the chunk, counted from its first frame.
+        rotations: (K-1, 3, 3) of the gyro between its frames.
+        initial: how sure the state of the recording's first frame is.
+        log_scale: of the motions.
+        k0: the chunk's first frame.
+        anchor: what the chunk before carries on; None = level by gravity.
+    """
+    R = gyro_chain(problem, rotations, k0)
+    if anchor is None:
+        R = level_rotation(problem, R, k0) @ R
+        anchor = first_anchor(se3.transform(R[0], np.zeros(3)), problem.gyro_bias_rad_s, initial)
+    else:
+        R = anchor.T_world_body[:3, :3] @ R
+    return R, *chain_positions(problem, motions, R, anchor.T_world_body[:3, 3], log_scale, k0), anchor
+
+
 def _carried(values: gtsam.Values, node: int) -> Anchor:
     return Anchor(values.atPose3(X(node)).matrix(), np.diag(CARRIED_POSE_SD**2), values.atVector(V(node)),
                   CARRIED_VELOCITY_SD, values.atConstantBias(B(node)), CARRIED_BIAS_SD)
@@ -143,13 +165,8 @@ def _solve_chunk(problem: Problem, config: RefineConfig, log_scale: float,
     k0, k1 = span
     inside = (problem.motions.i >= k0) & (problem.motions.j <= k1)
     motions = problem.motions.select(inside, first_node=k0)
-    R = gyro_chain(problem, np.array([m.deltaRij().matrix() for m in measurements]), k0)
-    if anchor is None:
-        R = level_rotation(problem, R, k0) @ R
-        anchor = first_anchor(se3.transform(R[0], np.zeros(3)), problem.gyro_bias_rad_s, config.initial)
-    else:
-        R = anchor.T_world_body[:3, :3] @ R
-    p, v = chain_positions(problem, motions, R, anchor.T_world_body[:3, 3], log_scale, k0)
+    rotations = np.array([m.deltaRij().matrix() for m in measurements])
+    R, p, v, anchor = first_guess(problem, motions, rotations, config.initial, log_scale, k0, anchor)
     guess = gtsam.Values()
     insert_states(guess, se3.transform(R, p), v, [anchor.bias] * len(R), k0)
     graph = gtsam.NonlinearFactorGraph()
