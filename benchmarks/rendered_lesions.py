@@ -203,4 +203,5 @@ def main_rendered(arguments: argparse.Namespace) -> None:
         space=np.median(values(rows, "space_error")), ellipsoid=held(rows, "space_inside"),
         judgement=judgement(rows), scale=np.median(off), scale_worst=off.max(), claimed=np.median(claimed),
         better=100 * np.mean([abs(row.error) < abs(row.motions_error) for row in both]))
-    record(arguments.name if arguments.name != "lesions" else "lesions_rendered", "Lesions along the gut, from rendered frames through the bundled network", body)
+    name = "lesions_rendered" if arguments.name == "lesions" else arguments.name
+    record(name, "Lesions along the gut, from rendered frames through the bundled network", body)

@@ -1,10 +1,10 @@
 """How wrong a predicted depth is, per pixel: a standard deviation of its logarithm.
 
 The error of a depth map has two parts. One is shared by the whole image, its scale: part of that is the scale of the
-recording's motions, which depth follows and an IMU can measure, part is the image's own. The other differs from pixel to
-pixel; its ln sd is linear in a few `PIXEL_SIGNALS`, fitted by Gaussian maximum likelihood to calibration recordings, so
-that sd² is the mean square of the error. Errors have heavier tails than a Gaussian, so the factor from sd to the 95 %
-interval is measured too.
+recording's motions, which depth follows and an IMU can measure, part is the image's own. The other differs from pixel
+to pixel; its ln sd is linear in a few `PIXEL_SIGNALS`, fitted by Gaussian maximum likelihood to calibration
+recordings, so that sd² is the mean square of the error. Errors have heavier tails than a Gaussian, so the factor from
+sd to the 95 % interval is measured too.
 """
 
 from __future__ import annotations

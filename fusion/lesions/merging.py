@@ -20,7 +20,7 @@ DEPTH_CORRELATION = 0.5
 """Neighbouring views of one place err alike in depth: this share of a sighting's own variance does not average out."""
 IMAGE_MEMORY_S = 2.0
 """How long predicted maps stay off by one scale: length of a Matérn-3/2 correlation in time, which says 0.97, 0.78,
-0.48 and 0.14 after 1/3, 1, 2 and 4 s where calibration recordings of the bundled weights have 0.95, 0.71, 0.44, 0.19."""
+0.48 and 0.14 after 1/3, 1, 2 and 4 s; the bundled weights have 0.95, 0.71, 0.44 and 0.19 on calibration recordings."""
 
 
 @dataclass(frozen=True)

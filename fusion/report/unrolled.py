@@ -6,7 +6,6 @@ Labels come from people's files: they are escaped in the table and never enter a
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 from html import escape
 from typing import Any
 
@@ -24,12 +23,17 @@ from fusion.result import Refinement
 Array = NDArray[np.float64]
 Row = Mapping[str, Any]
 
-BAND_FRAMES, THIN_FRAMES = 400, 12_000
+BAND_FRAMES = 400
 KINDS = (("finding", "lesions", "circle", "--lesion"), ("landmark", "landmarks", "diamond", "--landmark"))
 
 
 def unrolled_figure(refinement: Refinement, rows: Sequence[Row]) -> Figure:
-    """Arc length against time: the capsule's course with its 95 % band, lesions and landmarks with their intervals."""
+    """Arc length against time: the capsule's course with its 95 % band, lesions and landmarks with their intervals.
+
+    Args:
+        refinement: the frames that are drawn; of a long recording those that a picture needs (`kept.py`).
+        rows: of `lesions.json`, measured on all frames.
+    """
     course = Course(refinement)
     t, arc = course.t_s, course.centreline.frame_arc_m
     known = [row for row in rows if row["arc_length_mm"] is not None]
@@ -52,33 +56,16 @@ def unrolled_figure(refinement: Refinement, rows: Sequence[Row]) -> Figure:
 
 
 def _band(course: Course, factor: float) -> list[Figure]:
-    """The capsule's 95 % band, drawn at some of the frames; empty where it is unknown.
-
-    Long recordings are thinned for it: how the sampled trajectories wind takes most of the time, and the eye sees no
-    difference. The curve and the lesions are not thinned.
-    """
+    """The capsule's 95 % band, drawn at some of the frames; empty where it is unknown."""
     if course.joint is None:
         return []
-    kept, thin = _thinned(course.refinement)
-    places = np.unique(np.linspace(0, len(kept) - 1, BAND_FRAMES).round().astype(np.int64))
-    spread = [arc_interval(capsule_along(thin, int(place))) for place in places]
-    value, low, high = (np.array(part, float) for part in zip(*spread, strict=True))
-    frames = kept[places]
-    arc = course.centreline.frame_arc_m[frames]
-    t, low, high = course.t_s[frames], factor * (arc + low - value), factor * (arc + high - value)
+    frames = np.unique(np.linspace(0, len(course.t_s) - 1, BAND_FRAMES).round().astype(np.int64))
+    spread = [arc_interval(capsule_along(course, int(frame))) for frame in frames]
+    _, low, high = (np.array(part, float) for part in zip(*spread, strict=True))
+    t, low, high = course.t_s[frames], factor * low, factor * high
     return [{"x": figures.numbers(np.concatenate([t, t[::-1]])), "type": "scatter", "mode": "lines",
              "y": figures.numbers(np.concatenate([high, low[::-1]])), "fill": "toself",
              "fillcolor": "--refined-band", "name": "95 % of the capsule", "line": {"width": 0}, "hoverinfo": "skip"}]
-
-
-def _thinned(refinement: Refinement) -> tuple[NDArray[np.int64], Course]:
-    """Which of M frames are kept for the band, at most some `THIN_FRAMES`, and the course through them."""
-    joint, m = refinement.joint, len(refinement.trajectory)
-    every = np.arange(m) if joint is None else np.concatenate([np.arange(0, m, -(-m // THIN_FRAMES)), joint.node])
-    kept = np.unique(every).astype(np.int64)
-    if joint is not None:
-        joint = replace(joint, node=np.searchsorted(kept, joint.node))
-    return kept, Course(replace(refinement, trajectory=refinement.trajectory.select(kept), joint=joint))
 
 
 def _marks(rows: Sequence[Row], number: Sequence[int], name: str, symbol: str, colour: str, unit: str,
