@@ -200,8 +200,8 @@ openings.
 
 A curve holds at most some 3000 points whatever the length, so the page hardly grows. Frames are read from the run
 folder in blocks, twice: once for the numbers, which come from all of them, and once to choose what is drawn: of
-recordings of more than 12,000 frames the extremes of short spans and points evenly along the way. So memory does not
-grow with the recording beyond that."""
+recordings of more than 12,000 frames the extremes of short spans and points evenly along the way. What is kept beyond
+that does not depend on the length."""
 
 
 if __name__ == "__main__":
