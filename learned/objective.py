@@ -108,7 +108,9 @@ class Objective(nn.Module):
         motions = out.T_i_j if len(out.T_i_j) == 4 else both_directions(out.T_i_j)
         rotation = self._rotation_loss(out, batch)
         in_warp = {pair: self._in_warp(T.float(), pair, batch) for pair, T in motions.items()}
-        snippet = Snippet(batch.images, depth, tied(in_warp) if self.config.tied_motions else in_warp, batch.cameras, batch.usable[:, None].expand(-1, 3, -1, -1, -1))
+        in_warp = tied(in_warp) if self.config.tied_motions else in_warp
+        usable = batch.usable[:, None].expand(-1, 3, -1, -1, -1)
+        snippet = Snippet(batch.images, depth, in_warp, batch.cameras, usable)
         terms = consistency_loss(snippet, self._consistency_settings(batch))
         parts = dict(terms.parts) | _snr(out) | {"gyro_rotation": rotation.detach(), "step_length": _length(motions)}
         total = terms.total + self.config.rotation_weight * rotation

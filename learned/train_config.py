@@ -114,8 +114,8 @@ PAPER_RECIPE: dict[str, Any] = {}
 """Adam 1e-4, batch 4: the defaults."""
 MEASURED_RECIPE: dict[str, Any] = {
     "learning_rate": 1e-3, "warm_up_steps": 50, "schedule": "cosine", "clip_norm": 1.0, "ema_decay": 0.995,
-    "rotation_from": "gyro", "tied_motions": True, "rotation_weight": 1.0, "unit_depth_weight": 0.2, "light_start_steps": 150,
-    "depth_kind": "range", "precision": "bfloat16", "channels_last": True,
+    "rotation_from": "gyro", "tied_motions": True, "rotation_weight": 1.0, "unit_depth_weight": 0.2,
+    "light_start_steps": 150, "depth_kind": "range", "precision": "bfloat16", "channels_last": True,
 }
 """What was measured to train our own method within minutes: ten times the paper's rate, the gyro in the warp. With
 fewer than four triplets a process, consider `freeze_batch_norm` once there are weights to start from."""

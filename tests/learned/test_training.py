@@ -17,8 +17,8 @@ from learned.averaging import WeightAverage
 from learned.checkpoints import load_checkpoint, save_checkpoint
 from learned.dataset import TripletDataset, collate
 from learned.errors import CheckpointError, NetworkInputError, TrainingError
-from learned.methods import method_config
 from learned.lie import inverse, so3_exp, transform
+from learned.methods import method_config
 from learned.objective import Objective, tied
 from learned.train_config import (
     BOOKKEEPING,
