@@ -42,6 +42,8 @@ class GyroCorrelationConfig(MethodConfig):
     """Of a quarter, an eighth and a sixteenth of the image's resolution: reach 16, 32 and 64 px at radius 4."""
     image_size: tuple[int, int] = (128, 128)
     """Measured to train well; larger for finer detail."""
+    whole_image: bool = False
+    """One number per image, of the encoder's mean features, says how near everything is."""
     depth_range: DepthRange = field(default_factory=lambda: DepthRange(0.1, 4.0))
     """Units of 20 mm."""
     pose: PoseParametrisation = field(
@@ -65,7 +67,7 @@ def networks(config: GyroCorrelationConfig, weights: str | Path | None) -> Netwo
     if weights is not None:
         load_encoder(encoder, weights)
     pose = CorrelationPoseNetwork(base, config.radius, config.correlation_maps)
-    return Networks(DepthNetwork(encoder, decoder, full_size=True), pose)
+    return Networks(DepthNetwork(encoder, decoder, full_size=True, whole_image=config.whole_image), pose)
 
 
 def _logit(value: float) -> float:
