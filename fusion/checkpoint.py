@@ -48,8 +48,9 @@ def refinement_key(recording: Recording, motions: RelativeMotions, config: Refin
                    loops: Loops | None = None) -> str:
     """SHA-256 of everything that a refinement depends on."""
     calibration = recording.calibration
-    arrays: tuple[NDArray[Any], ...] = (recording.frame_t_s, recording.imu.t_ns, recording.imu.gyro_rad_s, recording.imu.accel_m_s2,
-              calibration.T_body_camera, motions.t_i_s, motions.t_j_s, motions.T_i_j, motions.cov)
+    arrays: tuple[NDArray[Any], ...] = (
+        recording.frame_t_s, recording.imu.t_ns, recording.imu.gyro_rad_s, recording.imu.accel_m_s2,
+        calibration.T_body_camera, motions.t_i_s, motions.t_j_s, motions.T_i_j, motions.cov)
     facts = {"config": config.to_dict(), "imu_noise": asdict(calibration.imu_noise), "name": recording.name,
              "time_offset_s": calibration.time_offset_s, "scale": [motions.scale_log_mean, motions.scale_log_sd],
              "motions_meta": motions.meta,

@@ -161,6 +161,8 @@ def _predict(commands: Commands) -> None:
     parser.add_argument("--rotation", choices=("network", "gyro"), default="network",
                         help="gyro: correct the rotation by the gyro; for use without `refine`, which does so itself")
     parser.add_argument("--depth", type=Path, metavar="DIR", help="also write the predicted depth maps and their sd")
+    parser.add_argument("--loops", type=Path, metavar="loops.npz",
+                        help="also look for places that are seen again, for `refine --loops-from`")
     parser.add_argument("--out", type=Path, required=True, metavar="motions.npz")
 
 
@@ -178,6 +180,10 @@ def _refine(commands: Commands) -> None:
     parser.add_argument("--lag", type=float, default=30.0, metavar="S",
                         help="how long a frame stays open to correction online (default: 30 s)")
     parser.add_argument("--config", type=Path, metavar="c.yaml")
+    again = parser.add_mutually_exclusive_group()
+    again.add_argument("--loops", action="store_true",
+                       help="look for places that are seen again, in the images, and close the loops")
+    again.add_argument("--loops-from", type=Path, metavar="loops.npz", help="close loops that predict --loops found")
     parser.add_argument("--out", type=Path, required=True, metavar="RUN")
     _json(parser)
 

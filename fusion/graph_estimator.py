@@ -102,7 +102,7 @@ class GraphEstimator:
             return replace(self._read(final, conclusion, fixed_chi2, inflation), translation_noise=noise, loops=closed)
 
     def _closed(self, final: _Pass, conclusion: ScaleConclusion) -> tuple[_Pass, LoopConclusion | None]:
-        """The solution with the loops that hold, and what became of all; the same where none was given or none holds."""
+        """The solution with the loops that hold, the same where none does, and what became of all."""
         if self.loops is None:
             return final, None
         before = self.loops.conclusion

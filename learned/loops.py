@@ -62,8 +62,19 @@ class LoopSearch:
     """Loops whose frames are both within so many frames share what they know; the surest is kept."""
     noise: RevisitNoise = field(default_factory=RevisitNoise)
     limits: RevisitLimits = field(default_factory=RevisitLimits)
-    sd_factor: tuple[float, float] = (1.5, 1.5)
-    """Real over claimed sd of rotation and translation."""
+
+
+@dataclass(frozen=True)
+class LoopTrace:
+    """A search with what every stage left."""
+
+    loops: Loops
+    proposed: list[Pair]
+    """Frames that look alike."""
+    verified: list[Pair]
+    """Of these, and of those tried beside them, what keypoints and depth confirm."""
+    supported: list[Pair]
+    """Of these, what neighbouring pairs agree with."""
 
 
 def find_loops(recording: Recording, motions: RelativeMotions, predictor: NetworkPredictor | str | Path | None = None,
@@ -84,6 +95,12 @@ def find_loops(recording: Recording, motions: RelativeMotions, predictor: Networ
         RecordingError: no images.
         MotionsError: motions of another recording.
     """
+    return trace_loops(recording, motions, predictor, search=search, progress=progress).loops
+
+
+def trace_loops(recording: Recording, motions: RelativeMotions, predictor: NetworkPredictor | str | Path | None = None,
+                *, search: LoopSearch | None = None, progress: Progress | None = None) -> LoopTrace:
+    """As `find_loops`, with what every stage left; for whoever judges the search."""
     search = search or LoopSearch()
     if not isinstance(predictor, NetworkPredictor):
         predictor = predictor_for(recording, load_weights(predictor))
@@ -98,20 +115,21 @@ def find_loops(recording: Recording, motions: RelativeMotions, predictor: Networ
         if progress is not None:
             progress(n + 1, len(proposed))
     unit, unit_sd = _unit(verified.views, motions, recording.frame_t_s, search)
-    found = {pair: _in_unit(revisit, unit, unit_sd, search) for pair, revisit in verified.found.items()}
+    found = {pair: _in_unit(revisit, unit, unit_sd) for pair, revisit in verified.found.items()}
     chain = _Chain(motions, recording.frame_t_s)
     for pair in [pair for pair in found if chain.support(pair, found, search.window) < search.support]:
         for i, j in ((pair[0] + a, pair[1] + b) for a, b in AROUND):
             if verified.compare(i, j):
-                found[i, j] = _in_unit(verified.found[i, j], unit, unit_sd, search)
+                found[i, j] = _in_unit(verified.found[i, j], unit, unit_sd)
     supported = {pair: loop for pair, loop in found.items()
                  if chain.support(pair, found, search.window) >= search.support}
     kept = _thinned(supported, search.spacing)
     refused = Counter(verified.refused)
     refused[UNSUPPORTED] += len(found) - len(supported)
     refused[BESIDE] += len(supported) - len(kept)
-    return Loops(_as_motions(kept, recording, motions, predictor, unit), verified.compared,
-                 {reason: count for reason, count in refused.items() if count})
+    loops = Loops(_as_motions(kept, recording, motions, predictor, unit), verified.compared,
+                  {reason: count for reason, count in refused.items() if count})
+    return LoopTrace(loops, [(i, j) for i, j in proposed.tolist()], sorted(found), sorted(supported))
 
 
 @dataclass(frozen=True)
@@ -176,10 +194,10 @@ def _unit(views: Views, motions: RelativeMotions, frame_t_s: Array, search: Loop
     return middle, float(np.hypot(UNIT_SD, 1.25 * spread / np.sqrt(len(ratio))))
 
 
-def _in_unit(revisit: Revisit, unit: float, unit_sd: float, search: LoopSearch) -> _Loop:
+def _in_unit(revisit: Revisit, unit: float, unit_sd: float) -> _Loop:
     T = revisit.T_i_j.copy()
     T[:3, 3] *= np.exp(unit)
-    factor = np.repeat(search.sd_factor, 3) * np.repeat([1.0, np.exp(unit)], 3)
+    factor = np.repeat([1.0, np.exp(unit)], 3)
     along = np.r_[np.zeros(3), T[:3, :3].T @ T[:3, 3]]
     return _Loop(T, revisit.cov * factor[:, None] * factor + unit_sd**2 * np.outer(along, along))
 
