@@ -75,7 +75,7 @@ def sentences(summary: dict[str, Any]) -> str:
         f"motions: {summary['motions']['used']} used, {summary['motions']['rejected']} rejected",
     ]
     if summary["loops"]["proposed"]:
-        lines.append(loops_in_words(summary["loops"]))
+        lines.append(f"loops: {loops_in_words(summary['loops'])}")
     if "online" in summary:
         ms = summary["online"]["latency_ms"]
         lines.append(f"online with {summary['online']['lag_s']:g} s lag: latency per frame {ms['p50']:.1f} ms in the "
@@ -88,6 +88,5 @@ def sentences(summary: dict[str, Any]) -> str:
 def loops_in_words(loops: dict[str, Any]) -> str:
     """Which places were recognised, and why the other proposals were not believed."""
     count, refused = loops["accepted"], sorted(loops["refused"].items(), key=lambda item: (-item[1], item[0]))
-    text = (f"loops: {count} of {loops['proposed']} pairs of frames that look alike were used as the same place seen "
-            "again")
-    return text + (": " + "; ".join(f"{n} not, {reason}" for reason, n in refused) if refused else "")
+    text = f"{count} of {loops['proposed']} pairs of frames that look alike were used as the same place seen again"
+    return text + (": " + "; ".join(f"{n} not, {reason}" for reason, n in refused) if refused else "") + "."

@@ -126,6 +126,7 @@ def test_the_run_folder_and_the_command_line_tell_of_loops(there_and_back, tmp_p
     assert summary["loops"]["proposed"] == 100 and count >= 5 and summary["loops"]["refused"] | WORDS == \
         summary["loops"]["refused"]
     assert f"loops: {count} of 100 pairs" in said and "88 not, hardly a detail" in said
+    assert f"{count} of 100 pairs" in (out / "report.html").read_text()
     rows = (out / "loops.csv").read_text().splitlines()
     assert rows[0] == "frame_i,frame_j,t_i_s,t_j_s,distance2,accepted" and len(rows) == 7
     assert sum(int(row.split(",")[-1]) for row in rows[1:]) == count
