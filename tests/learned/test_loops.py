@@ -60,7 +60,8 @@ def test_frames_that_are_shown_again_are_found_where_they_were(seen):
 
 def test_what_is_shown_once_is_no_loop(seen):
     recording, motions, _ = seen
-    first = replace(recording, frame_t_ns=recording.frame_t_ns[:FRAMES], frame_paths=recording.frame_paths[:FRAMES])
+    first = replace(recording, frame_t_ns=recording.frame_t_ns[:FRAMES], frame_paths=recording.frame_paths[:FRAMES],
+                    depth_paths=())
     t = first.frame_t_s
     inside = motions.t_j_s <= t[-1] + 1e-6
     once = RelativeMotions(motions.t_i_s[inside], motions.t_j_s[inside], motions.T_i_j[inside], motions.cov[inside],
