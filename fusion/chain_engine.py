@@ -1,4 +1,4 @@
-"""The engine of recordings whose motions join frames close in time: one band in the order of time."""
+"""The engine of recordings whose motions join frames close in time: one band in the order of time, and a few loops."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from fusion.chain import POSE
-from fusion.chain_model import ChainModel, ScaleWalk
+from fusion.chain_model import LONGEST_REACH, ChainModel, ScaleWalk
 from fusion.chain_solve import chain_gauss_newton
 from fusion.chain_start import chain_start, inertial_steps
 from fusion.config import RefineConfig
@@ -15,9 +15,6 @@ from fusion.engine import Begin, Step, Uncertainty
 from fusion.problem import Problem
 from fusion.scale import Segments
 from fusion.solve import MotionTerm, Solution
-
-LONGEST_REACH = 4
-"""Frames that a motion may span; the work per frame grows with its square."""
 
 
 class ChainEngine:

@@ -47,6 +47,7 @@ def predict(arguments: argparse.Namespace) -> int:
     from vio.formats import open_recording
 
     recording = open_recording(arguments.recording)
+    motions: RelativeMotions
     if arguments.method == "classical":
         from vio.odometry import measure_recording
 
@@ -64,6 +65,13 @@ def predict(arguments: argparse.Namespace) -> int:
     lost = motions.meta.get("unreadable_frames", {})
     print(f"{arguments.out}: {len(motions)} motions"
           + (f"; without frame {', '.join(lost)}: {next(iter(lost.values()))}" if lost else ""))
+    if arguments.loops is not None:
+        from learned.loops import find_loops
+
+        with Progress() as progress:
+            loops = find_loops(recording, motions, arguments.weights, progress=progress.count)
+        loops.save(arguments.loops)
+        print(f"{arguments.loops}: {len(loops)} loops of {loops.proposed} pairs of frames that look alike")
     return 0
 
 

@@ -1,4 +1,4 @@
-"""The factor-graph recipe: chunks → fixed scale → scale policy → Huber → gate → Gaussian → covariances."""
+"""The factor-graph recipe: chunks → fixed scale → scale policy → Huber → gate → Gaussian → loops → covariances."""
 
 from __future__ import annotations
 
@@ -18,10 +18,11 @@ from fusion.estimate import Estimate, add_scale_uncertainty
 from fusion.graph import read_log_scales, read_states
 from fusion.initialization import search_log_scale
 from fusion.joint import SEED, with_assumed_scale
+from fusion.loops import GraphLoops, close_loops, none_held
 from fusion.motion_noise import is_right, translation_noise, with_noise
 from fusion.native_engine import NativeEngine
 from fusion.problem import Problem
-from fusion.result import ScaleConclusion, ScalePolicy
+from fusion.result import LoopConclusion, ScaleConclusion, ScalePolicy
 from fusion.scale import FreePass, Segments
 from fusion.solve import MotionTerm, Solution
 from fusion.stages import Stages
@@ -59,8 +60,8 @@ class GraphEstimator:
     """Solves one problem; holds what the passes share."""
 
     def __init__(self, problem: Problem, config: RefineConfig, stages: Stages,
-                 checkpoint: Checkpoint | None = None) -> None:
-        self.problem, self.config, self.stages = problem, config, stages
+                 checkpoint: Checkpoint | None = None, loops: GraphLoops | None = None) -> None:
+        self.problem, self.config, self.stages, self.loops = problem, config, stages, loops
         self.engine: Engine = NativeEngine()
         if ChainEngine.suits(problem):
             self.engine = ChainEngine() if checkpoint is None else ResumableEngine(ChainEngine(), checkpoint)
@@ -96,8 +97,37 @@ class GraphEstimator:
             self.problem = replace(given, motions=with_noise(given.motions, 1.0, noise))
         else:
             final, conclusion, fixed_chi2, inflation = self._solve()
+        final, closed = self._closed(final, conclusion)
         with self.stages("covariances"):
-            return replace(self._read(final, conclusion, fixed_chi2, inflation), translation_noise=noise)
+            return replace(self._read(final, conclusion, fixed_chi2, inflation), translation_noise=noise, loops=closed)
+
+    def _closed(self, final: _Pass, conclusion: ScaleConclusion) -> tuple[_Pass, LoopConclusion | None]:
+        """The solution with the loops that hold, the same where none does, and what became of all."""
+        if self.loops is None:
+            return final, None
+        before = self.loops.conclusion
+        if len(before.frames) == 0:
+            return final, before
+        with self.stages("loops"):
+            unsure = final.uncertainty or self._uncertainty(final)
+            if unsure.joint is None:
+                return final, none_held(before, "how sure the graph is could not be sampled")
+            joint, rng = unsure.joint, np.random.default_rng(SEED + 2)
+            if conclusion.assumed_sd > 0:
+                states = read_states(final.solution.values, 0, len(self.problem))
+                joint = with_assumed_scale(joint, states.T_world_body, conclusion.assumed_sd,
+                                           self.problem.motions.T_body_camera, rng)
+            of_node = None if final.term.segment is None else self.segments.of_node
+            try:
+                found = close_loops(self.engine, Begin(final.model, final.solution.values), final.term, self.loops,
+                                    joint, of_node, self.config)
+            except EstimationError as error:
+                self.notes.append(f"{error}; refined without loops")
+                return final, none_held(before, "the graph has no solution with it")
+        if found is None:
+            return final, none_held(before)
+        term, solution, closed = found
+        return self._finished(final.model, term, solution), closed
 
     def _solve(self) -> tuple[_Pass, ScaleConclusion, float, float]:
         """Solution, what it says of scale, the IMU's chi² at fixed scale and the accelerometer's inflation."""

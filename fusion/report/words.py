@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 from fusion.result import Refinement
+from fusion.summary import loops_in_words
 
 MODES = {"none": "no alignment", "origin": "first poses laid together", "yaw4": "yaw and translation",
          "se3": "SE(3): rotation and translation", "sim3": "Sim(3): rotation, translation and scale"}
@@ -132,6 +133,8 @@ def sentences(
     out.append(("IMU", _imu(refinement)))
     out.append(("Camera and IMU", _camera_imu(refinement)))
     out.append(("Motions", _motions(refinement)))
+    if (summary.get("loops") or {}).get("proposed"):
+        out.append(("Loops", _begun(loops_in_words(summary["loops"]))))
     if within_3_sigma is not None:
         out.append(("Certainty", f"{100 * within_3_sigma:.1f} % of the positions lie inside their claimed 3-sigma "
                                "ellipsoid, first poses laid together; an honest claim holds for 99.7 %."))
