@@ -50,7 +50,7 @@ def test_signals_that_change_steadily_are_cut_exactly(problem, coefficients):
         part, (lo, hi) = slice(pieces.first[k], pieces.first[k + 1]), frames[k:k + 2]
         h = pieces.dt_s[part]
         np.testing.assert_allclose(h.sum(), hi - lo, rtol=1e-12)
-        np.testing.assert_allclose(h @ pieces.accel_m_s2[part], h @ turned_force[part], atol=1e-6)  # a ramp adds nothing
+        np.testing.assert_allclose(h @ pieces.accel_m_s2[part], h @ turned_force[part], atol=1e-6)
         arm = hi - centre[part]
         if h @ (arm - (hi - lo) / 2) ** 2 > 0.021 * (hi - lo) ** 3:
             exact = c * (hi - lo) ** 2 / 2 + d * ((hi - lo) ** 3 / 6 + lo * (hi - lo) ** 2 / 2)
