@@ -144,15 +144,16 @@ def _read(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:
     name = path.name
     try:
         with path.open("rb") as file:
-            start = file.read(9)
+            start = file.read(2)
     except OSError as error:
         raise WeightsError(f"weights {name}: {error.strerror or 'cannot be read'}; give a .safetensors file") from None
-    if start[:2] == b"PK" or start[:1] == b"\x80":
-        raise WeightsError(f"weights {name}: a pickle, which can run code when it is opened; give safetensors")
     try:
         with safetensors.safe_open(path, framework="pt") as opened:
             return {key: opened.get_tensor(key) for key in list(opened.keys())}, dict(opened.metadata() or {})
     except (safetensors.SafetensorError, OSError):
+        if start == b"PK" or start[:1] == b"\x80":  # only of what is no safetensors: its header may begin so too
+            raise WeightsError(f"weights {name}: a pickle, which can run code when it is opened; give safetensors"
+                               ) from None
         raise WeightsError(f"weights {name}: damaged, or no safetensors file; get it again") from None
 
 

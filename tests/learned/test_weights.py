@@ -17,7 +17,7 @@ from learned.calibration import calibrated, write_calibrated
 from learned.errors import TrainingError, WeightsError
 from learned.evaluation import depth_score, motion_score, trivial_depths, trivial_motions
 from learned.gyro_update import with_gyro
-from learned.inference import SIGNALS, estimate_pairs
+from learned.inference import SIGNALS, distinct, estimate_pairs
 from learned.measured import Measured, measure
 from learned.methods import build_method
 from learned.report import evaluate, format_evaluation
@@ -296,3 +296,22 @@ def test_both_orders_are_averaged_and_no_pair_sees_another(ball):
     alone = estimate_pairs(method, frames, windows, camera_batch([source.camera]), "range")
     np.testing.assert_allclose(alone.T_i_j[0], m.T_i_j[5], atol=1e-5)
     assert alone.signals.shape == (1, len(SIGNALS)) and torch.isfinite(alone.signals).all()
+
+
+def test_a_header_whose_length_looks_like_a_pickle_is_read(tmp_path):
+    path, method, starts = tmp_path / "weights.safetensors", small(), set()
+    for k in range(0, 257, 8):  # headers are padded to eight bytes; the lowest byte of their length comes first
+        save_weights(path, method, CARD | {"remark": "x" * k})
+        starts.add(path.read_bytes()[0])
+        load_weights(path)
+    assert 0x80 in starts
+
+
+def test_frames_that_two_pairs_share_are_shown_once():
+    frame = torch.rand(6, 3, 8, 8)
+    pairs = torch.stack([torch.stack([frame[a], frame[b]]) for a, b in ((0, 1), (1, 2), (3, 4), (4, 5))])
+    shots = distinct(pairs)
+    assert len(shots.frames) == 6 and shots.pair == [0, 1, 1, 2, 3, 3]
+    for k in range(4):
+        assert torch.equal(torch.stack([shots.frames[shots.i[k]], shots.frames[shots.j[k]]]), pairs[k])
+    assert [shots.pair[i] for i in shots.i] == [0, 1, 2, 3] and all(np.array(shots.i) < shots.j)
