@@ -30,6 +30,7 @@ from fusion.joint import JointSamples
 from fusion.preintegration import make_bias
 from fusion.problem import Problem
 from fusion.scale import Segments
+from fusion.scaled_motion import Linearized
 from fusion.solve import MotionTerm, Solution
 from fusion.stretches import Stretch
 from vio.atomic import atomic_write
@@ -178,9 +179,10 @@ class ResumableEngine:
                                     "xi": found.joint.xi, "log_scale": found.joint.log_scale})
         return found
 
-    def step(self, begin: Begin, term: MotionTerm) -> Step:
-        """As `ChainEngine.step`; quicker to compute again than to store."""
-        return self.engine.step(begin, term)
+    def response(self, begin: Begin, term: MotionTerm, blocks: Linearized,
+                 error: NDArray[np.float64]) -> Step:
+        """As `ChainEngine.response`; quicker to compute again than to store."""
+        return self.engine.response(begin, term, blocks, error)
 
     def _next(self, kind: str) -> str:
         self._calls += 1

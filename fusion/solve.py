@@ -106,12 +106,11 @@ class Solution:
     iterations: int
 
 
-def linear_graph(native: gtsam.NonlinearFactorGraph, values: gtsam.Values,
-                 term: MotionTerm) -> gtsam.GaussianFactorGraph:
-    """All factors linearised at `values`."""
+def linear_graph(native: gtsam.NonlinearFactorGraph, values: gtsam.Values, term: MotionTerm,
+                 blocks: Linearized | None = None) -> gtsam.GaussianFactorGraph:
+    """All factors linearised at `values`, the motions as `blocks` has them if given."""
     gaussian = native.linearize(values)
-    blocks = linearize(term.motions, *read_poses(values), term.log_scale(values))
-    _push(gaussian, blocks, term)
+    _push(gaussian, blocks or linearize(term.motions, *read_poses(values), term.log_scale(values)), term)
     return gaussian
 
 
