@@ -28,7 +28,7 @@ from learned.benchmark.scores import mean_log_snr
 from learned.benchmark.statistics import paired_difference
 from learned.evaluation import depth_score, motion_score, trivial_depths, trivial_motions
 from learned.measured import Measured, measure
-from learned.methods import method_config
+from learned.methods import assemble, method_config
 from learned.train_config import MEASURED_BRANCH, MEASURED_FUSION, TrainConfig, train_config, train_config_to_dict
 from learned.training import train
 from vio.atomic import atomic_write
@@ -88,7 +88,6 @@ def run(arm: str, seed: int, steps: int, data: Path, out: Path, judged: list[Rec
 def guesses(data: Path, judged: list[Recording], steps: int) -> list[dict[str, float]]:
     """The best depth without a network, and rest."""
     config = decisions(ARMS[0], 0, steps)
-    from learned.methods import assemble
     measured = [measure(assemble(config.method, seed=0).eval(), config.depth_kind, recording) for recording in judged]
     maps = priors(part(data, "train")[:36], measured, [m.camera for m in measured])
     return scores(trivial_depths(measured, maps)[GUESS["depth"]], trivial_motions(measured)[GUESS["motion"]], measured)
@@ -122,37 +121,50 @@ def groups(judged: list[Recording]) -> dict[str, list[int]]:
 def body(found: dict, seeds: int, steps: int, data: Path, judged: list[Recording], note: str) -> str:
     """The page."""
     of = groups(judged)
-    guess = guesses(data, judged, steps)
     whole = of["all that vibrate"]
-    per_seed = [[arm, str(seed), *(f"{METRICS[m][1] * cells(found, arm, m, seeds, whole)[seed].mean():.{METRICS[m][2]}f}"
-                                   for m in METRICS), f"{found[arm, seed]['loss']['photometric']:.4f}",
-                 str(found[arm, seed]["skipped"])] for seed in range(seeds) for arm in ARMS]
-    per_seed.append(["no network", "", *(f"{METRICS[m][1] * np.mean([guess[k][m] for k in whole]):.{METRICS[m][2]}f}"
-                                         for m in METRICS), "", ""])
     header = ["recordings", "metric", *ARMS, "difference", "95 % interval", "vibration ahead", "says"]
-    snr = [[f"{recording.provenance['vibration']}, level {recording.provenance['vibration_level']}",
-            *(f"{np.exp(found[ARMS[1], seed]['log_snr'][k]):.2f}" for seed in range(seeds))]
-           for k, recording in enumerate(judged)]
-    snr.sort(key=lambda row: (row[0].split(",")[0], int(row[0].split()[-1])))
     return "\n\n".join([
-        f"The fifth method, `gyro-correlation`, with Fourier heterogeneous fusion and without vibration: {seeds} seeds, "
-        f"{steps} steps at batch 4 and 128 × 128 px with the measured recipe, from random weights, on the "
-        f"{len(training_recordings(data))} recordings with vibration among the 36 training recordings. Judged on "
-        f"{len(judged)} recordings that nothing was trained on, {len(whole)} of them with vibration. The arms share data, "
-        "order of data, seeds, steps and the start of their vision networks. Both have the gyro's rotation in the warp "
-        "while they train.",
+        "The fifth method, `gyro-correlation`, with Fourier heterogeneous fusion and without vibration: "
+        f"{seeds} seeds, {steps} steps at batch 4 and 128 × 128 px with the measured recipe, from random weights, on "
+        f"the {len(training_recordings(data))} recordings with vibration among the 36 training recordings. Judged on "
+        f"{len(judged)} recordings that nothing was trained on, {len(whole)} of them with vibration. The arms share "
+        "data, order of data, seeds, steps and the start of their vision networks. Both have the gyro's rotation in "
+        "the warp while they train.",
         *([note] if note else []),
-        f"## Differences\n\nMeans over seeds and recordings, vision–vibration minus vision-only, intervals from {seeds} "
-        "seeds × recordings, both resampled and stretched for how few they are (`learned/benchmark/statistics.py`). "
-        "Depth after one median scale per image (AbsRel, Acc) or per recording; rotation: mean angle; direction: "
-        "median angle of each recording where the camera moves more than 0.5 mm; step: after one scale per recording.\n\n"
+        "## Differences\n\nMeans over seeds and recordings, vision–vibration minus vision-only; intervals from seeds "
+        "and recordings, both resampled and stretched for how few they are (`learned/benchmark/statistics.py`). Depth "
+        "after one median scale per image (AbsRel, Acc) or per recording; rotation: mean angle; direction: median angle of "
+        "each recording where the camera moves more than 0.5 mm; step: after one scale per recording.\n\n"
         + table(header, [difference_row(found, m, seeds, row, chosen) for row, chosen in of.items() for m in METRICS]),
-        "## Trainings\n\nOver the recordings that vibrate. \"No network\": the geometric mean of brightness^-1/2 and the "
-        "mean inverse-depth map of the training recordings, and rest. Photometric: of the validation split.\n\n"
-        + table(["arm", "seed", *(label for label, *_ in METRICS.values()), "photometric", "steps lost"], per_seed),
-        "## SNR\n\nGeometric mean over the blocks of both networks and the pairs of each recording; all blocks start at "
-        "4, and where it does not differ between recordings the branch has learned nothing.\n\n"
-        + table(["vibration", *(f"seed {seed}" for seed in range(seeds))], snr)])
+        "## Trainings\n\nOver the recordings that vibrate. \"No network\": the geometric mean of brightness^-1/2 and "
+        "the mean inverse-depth map of the training recordings, and rest. Photometric: of the validation split.\n\n"
+        + table(["arm", "seed", *(label for label, *_ in METRICS.values()), "photometric", "steps lost"],
+                training_rows(found, seeds, whole, guesses(data, judged, steps))),
+        "## SNR\n\nGeometric mean over the blocks of both networks and the pairs of each recording; all blocks start "
+        "at 4, and where it does not differ between recordings the branch has learned nothing.\n\n"
+        + table(["vibration", *(f"seed {seed}" for seed in range(seeds))], snr_rows(found, seeds, judged))])
+
+
+def training_rows(found: dict, seeds: int, chosen: list[int], guess: list[dict[str, float]]) -> list[list[str]]:
+    """Every training by itself, and no network."""
+    def shown(values: dict[str, float]) -> list[str]:
+        return [f"{METRICS[m][1] * values[m]:.{METRICS[m][2]}f}" for m in METRICS]
+    rows = []
+    for seed in range(seeds):
+        for arm in ARMS:
+            means = {m: float(cells(found, arm, m, seeds, chosen)[seed].mean()) for m in METRICS}
+            run_ = found[arm, seed]
+            rows.append([arm, str(seed), *shown(means), f"{run_['loss']['photometric']:.4f}", str(run_["skipped"])])
+    nothing = {m: float(np.mean([guess[k][m] for k in chosen])) for m in METRICS}
+    return [*rows, ["no network", "", *shown(nothing), "", ""]]
+
+
+def snr_rows(found: dict, seeds: int, judged: list[Recording]) -> list[list[str]]:
+    """SNR of every recording, by kind and level of vibration."""
+    order = sorted(range(len(judged)), key=lambda k: (str(judged[k].provenance["vibration"]),
+                                                      int(judged[k].provenance["vibration_level"])))
+    return [[f"{judged[k].provenance['vibration']}, level {judged[k].provenance['vibration_level']}",
+             *(f"{np.exp(found[ARMS[1], seed]['log_snr'][k]):.2f}" for seed in range(seeds))] for k in order]
 
 
 def main() -> None:

@@ -270,8 +270,8 @@ def test_weights_that_are_not_there_are_named(recording: Recording, weights: str
     with pytest.raises(learned.WeightsError, match=f"weights {Path(weights).name}: No such file") as caught:
         learned.predict(recording, weights)
     assert "somewhere" not in str(caught.value) and caught.value.exit_code == 3
-    with pytest.raises(ConfigError, match="only weights calibrated with an IMU"):
-        learned.predict(recording, BarShift(), rotation="gyro")
+    with pytest.raises(ConfigError, match="rotation 'imu' is unknown"):
+        learned.predict(recording, BarShift(), rotation="imu")
 
 
 def test_unusable_input_is_refused(recording: Recording) -> None:
