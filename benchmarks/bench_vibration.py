@@ -133,8 +133,8 @@ def body(found: dict, seeds: int, steps: int, data: Path, judged: list[Recording
         *([note] if note else []),
         "## Differences\n\nMeans over seeds and recordings, vision–vibration minus vision-only; intervals from seeds "
         "and recordings, both resampled and stretched for how few they are (`learned/benchmark/statistics.py`). Depth "
-        "after one median scale per image (AbsRel, Acc) or per recording; rotation: mean angle; direction: median angle "
-        "of each recording where the camera moves more than 0.5 mm; step: after one scale per recording.\n\n"
+        "after one median scale per image (AbsRel, Acc) or per recording; rotation: mean angle; direction: median "
+        "angle of each recording where the camera moves more than 0.5 mm; step: after one scale per recording.\n\n"
         + table(header, [difference_row(found, m, seeds, row, chosen) for row, chosen in of.items() for m in METRICS]),
         "## Trainings\n\nOver the recordings that vibrate. \"No network\": the geometric mean of brightness^-1/2 and "
         "the mean inverse-depth map of the training recordings, and rest. Photometric: of the validation split.\n\n"

@@ -68,7 +68,8 @@ class _EarlyStop:
 
 
 def train(recordings: Sequence[Recording], config: TrainConfig, out: str | Path, *, device: str | None = None,
-          progress: Progress | None = None, start_from: Mapping[str, Tensor] | None = None) -> TrainedRun:
+          progress: Progress | None = None, start_from: Mapping[str, Tensor] | None = None,
+          alone: bool = False) -> TrainedRun:
     """Train, or go on training.
 
     Under `torchrun` all processes call this; the first writes the files.
@@ -80,6 +81,7 @@ def train(recordings: Sequence[Recording], config: TrainConfig, out: str | Path,
         device: "cpu" or "cuda"; None = cuda where there is one.
         progress: called with (steps done, steps in all) after every step.
         start_from: weights to start a new run with, by name; None = drawn from the seed.
+        alone: train in this process alone, though there are others.
 
     Raises:
         CheckpointError: the folder's checkpoint is damaged, or of a run with other decisions.
@@ -87,7 +89,7 @@ def train(recordings: Sequence[Recording], config: TrainConfig, out: str | Path,
         TrainingError: gradients stay without finite values.
         OutputError: the folder cannot be written.
     """
-    with team(device) as members:
+    with team(device, alone) as members:
         trainer = Trainer(recordings, config, Path(out), members, start_from)
         trainer.resume()
         trainer.run(progress)
