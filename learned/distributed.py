@@ -11,6 +11,8 @@ from typing import Any
 
 import torch
 import torch.distributed as dist
+from torch.distributed.distributed_c10d import PrefixStore
+from torch.distributed.rendezvous import rendezvous
 
 POLL_S = 0.2
 
@@ -105,8 +107,8 @@ def shares(what: str) -> Shares:
     """
     if int(os.environ.get("WORLD_SIZE", "1")) == 1:
         return Shares()
-    store, rank, size = next(iter(dist.rendezvous("env://")))
-    return Shares(rank == 0, dist.PrefixStore(what, store), size)
+    store, rank, size = next(iter(rendezvous("env://")))
+    return Shares(rank == 0, PrefixStore(what, store), size)
 
 
 def _kind(device: str | None) -> str:

@@ -179,7 +179,7 @@ def _check(recording: Recording, predictor: Predictor) -> None:
         raise RecordingError(
             f"recording {recording.name}: {len(recording)} frame(s), too few for a pair {min(baselines)} apart"
         )
-    if not recording.has_images:
+    if not recording.has_any_image:
         raise RecordingError(
             f"recording {recording.name}: images are missing; restore cam0/data, or give motions with `--motions`"
         )
