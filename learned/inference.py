@@ -13,7 +13,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from learned.camera_rays import CameraBatch
-from learned.lie import inverse, so3_exp, so3_log, transform
+from learned.lie import halfway, inverse, so3_log
 from learned.losses.photometric import Photometric, compare
 from learned.losses.terms import masked_mean
 from learned.methods import Method
@@ -55,7 +55,7 @@ def estimate_pairs(method: Method, frames: Tensor, vibration: Tensor | None, cam
     out = method(frames, vibration, depth_frames=(0,), pairs=((0, 1), (1, 0)))
     depth = out.depth[0].depth[0].float()
     there, back = out.T_i_j[0, 1].float(), inverse(out.T_i_j[1, 0].float())
-    T = _mean(there, back)
+    T = halfway(there, back)
     snr = None
     if out.snr_depth:
         every = torch.cat([out.snr_depth[0], out.snr_pose[0, 1]], 1).float()
@@ -63,12 +63,6 @@ def estimate_pairs(method: Method, frames: Tensor, vibration: Tensor | None, cam
     z = to_z_depth(depth, cameras, depth_kind)
     signals = _signals(frames, depth, T, there, back, snr, cameras, depth_kind)
     return PairEstimate(T, z, snr, signals)
-
-
-def _mean(a: Tensor, b: Tensor) -> Tensor:
-    """Half-way between rigid motions (B, 4, 4): rotation along the geodesic, translation along the line."""
-    half = so3_exp(0.5 * so3_log(a[:, :3, :3].transpose(1, 2) @ b[:, :3, :3]))
-    return transform(a[:, :3, :3] @ half, 0.5 * (a[:, :3, 3] + b[:, :3, 3]))
 
 
 def _signals(frames: Tensor, depth: Tensor, T: Tensor, there: Tensor, back: Tensor, snr: Tensor | None,

@@ -17,8 +17,9 @@ from learned.averaging import WeightAverage
 from learned.checkpoints import load_checkpoint, save_checkpoint
 from learned.dataset import TripletDataset, collate
 from learned.errors import CheckpointError, NetworkInputError, TrainingError, WeightsError
+from learned.lie import inverse, so3_exp, transform
 from learned.methods import method_config
-from learned.objective import Objective
+from learned.objective import Objective, tied
 from learned.train_config import (
     BOOKKEEPING,
     TrainConfig,
@@ -193,6 +194,26 @@ def test_the_gyros_rotation_warps_and_teaches(ball):
         assert right["gyro_rotation"] > 0.01
         with pytest.raises(NetworkInputError, match="no inertial samples"):
             objective(dataclasses.replace(batch, R_i_j_gyro=None), 0)
+
+
+def test_one_motion_a_pair_holds_the_scale_of_both_directions(ball):
+    turn = so3_exp(torch.tensor([[0.1, -0.2, 0.05]]))
+    there, back = (transform(turn, length * torch.tensor([[1.0, 2.0, -1.0]])) for length in (1.0, 1.6))
+    one = tied({(0, 1): there, (1, 0): inverse(back)})
+    torch.testing.assert_close(one[0, 1], transform(turn, 1.3 * torch.tensor([[1.0, 2.0, -1.0]])))
+    torch.testing.assert_close(one[0, 1] @ one[1, 0], torch.eye(4)[None])
+    torch.testing.assert_close(tied(one)[1, 0], one[1, 0])
+
+    batch = collate([TripletDataset([ball], source_settings(tiny()), "train", augment=False)[2]])
+    method = Trainer([ball], tiny(), Path("unused")).method.eval()
+    losses = []
+    for ties in (True, False):
+        method.zero_grad()
+        loss = Objective(method, tiny(tied_motions=ties)).eval()(batch)[0]
+        loss.backward()
+        losses.append(loss.item())
+        assert all(p.grad.isfinite().all() for p in method.parameters() if p.grad is not None)
+    assert losses[0] != losses[1]
 
 
 def test_validation_leaves_the_run_as_it_was(ball, tmp_path):
