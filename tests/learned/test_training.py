@@ -16,7 +16,7 @@ import torch
 from learned.averaging import WeightAverage
 from learned.checkpoints import load_checkpoint, save_checkpoint
 from learned.dataset import TripletDataset, collate
-from learned.errors import CheckpointError, NetworkInputError, TrainingError
+from learned.errors import CheckpointError, NetworkInputError, TrainingError, WeightsError
 from learned.lie import inverse, so3_exp, transform
 from learned.methods import method_config
 from learned.objective import Objective, tied
@@ -227,6 +227,10 @@ def test_frozen_batch_norms_train_as_they_are_used(ball, tmp_path):
     config = tiny(freeze_batch_norm=True, dropout=0.0, light_start_steps=0, ema_decay=0.0)
     trainer = Trainer([ball], config, tmp_path, start_from=warm)
     assert all(torch.equal(value, warm[name]) for name, value in trainer.method.state_dict().items())
+    for start, says in (({"a": torch.zeros(1)}, "they lack"), (warm | {"a": torch.zeros(1)}, "unknown a"),
+                        ({name: value[..., None] for name, value in warm.items()}, "another shape")):
+        with pytest.raises(WeightsError, match=f"^start weights: .*{says}"):
+            Trainer([ball], config, tmp_path, start_from=start)
     batch = next(trainer._batches())
     with torch.no_grad():
         training, use = trainer.objective(batch, 0)[0], trainer.objective.eval()(batch, 0)[0]
