@@ -204,6 +204,7 @@ def main() -> None:
     """Run all recordings on all cores and record one table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--rendered", action="store_true", help="see benchmarks/rendered_lesions.py")
+    parser.add_argument("--weights", type=Path, help="with --rendered, instead of the bundled ones")
     parser.add_argument("--seeds", type=int, nargs="+")
     parser.add_argument("--duration", type=float)
     parser.add_argument("--scenes", nargs="+", default=["gaussian:1", "peristalsis:3", "collision:5"])

@@ -41,8 +41,9 @@ SAME_DEPTH = 0.08
 """A spot is seen in a neighbouring frame where the rendered depth at its pixel is its own, to so much."""
 
 
-def run_rendered(job: tuple[str, str, int, int, str, float]) -> tuple[list[Row], tuple[float, float]]:
-    """Render one recording, measure it with the bundled network, refine, and place its spots and marks.
+def run_rendered(job: tuple[str, str, int, int, str, float], weights: Path | None = None
+                 ) -> tuple[list[Row], tuple[float, float]]:
+    """Render one recording, measure it with a network (None = the bundled one), refine, and place its spots and marks.
 
     Returns:
         The rows, and error and claimed standard deviation of the refined scale, both as shares.
@@ -53,7 +54,7 @@ def run_rendered(job: tuple[str, str, int, int, str, float]) -> tuple[list[Row],
         folder = Path(name)
         write_rendered(simulation, folder / "REC")
         recording = vio.open_recording(folder / "REC")
-        motions = learned.predict(recording, depth_dir=folder / "DEPTH")
+        motions = learned.predict(recording, weights, depth_dir=folder / "DEPTH")
         lumen = true_lumen(simulation)
         spots = draw_spots(recording, lumen, np.random.default_rng(seed)) + marks_of(folder / "REC", recording, lumen)
         rows = [row for k, spot in enumerate(spots) for row in seen_around(recording, spot, k)]
@@ -187,7 +188,7 @@ def main_rendered(arguments: argparse.Namespace) -> None:
     rows: list[Row] = []
     scales = []
     for job in jobs:
-        found, scale = run_rendered(job)
+        found, scale = run_rendered(job, arguments.weights)
         print(job, len(found), np.round(values(found, "error"), 1).tolist(), held(found, "inside"), scale, flush=True)
         rows += found
         scales.append(scale)
@@ -202,4 +203,5 @@ def main_rendered(arguments: argparse.Namespace) -> None:
         space=np.median(values(rows, "space_error")), ellipsoid=held(rows, "space_inside"),
         judgement=judgement(rows), scale=np.median(off), scale_worst=off.max(), claimed=np.median(claimed),
         better=100 * np.mean([abs(row.error) < abs(row.motions_error) for row in both]))
-    record("lesions_rendered", "Lesions along the gut, from rendered frames through the bundled network", body)
+    name = "lesions_rendered" if arguments.name == "lesions" else arguments.name
+    record(name, "Lesions along the gut, from rendered frames through the bundled network", body)

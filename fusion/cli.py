@@ -288,13 +288,13 @@ def _locate(arguments: argparse.Namespace) -> int:
 def _report(arguments: argparse.Namespace) -> int:
     from fusion.lesions import read_lesions
     from fusion.report import write_report
-    from fusion.run_folder import read_run
-    from fusion.run_states import read_refinement
+    from fusion.run_folder import read_summary
+    from fusion.run_stream import RunFrames
     from vio.formats import open_recording
 
     recording = None if arguments.recording is None else open_recording(arguments.recording)
-    refinement, summary = read_refinement(arguments.run), read_run(arguments.run).summary
-    write_report(refinement, summary, arguments.run / "report.html", lesions=read_lesions(arguments.run),
+    summary = read_summary(arguments.run)
+    write_report(RunFrames(arguments.run), summary, arguments.run / "report.html", lesions=read_lesions(arguments.run),
                  recording=recording)
     print(arguments.run / "report.html")
     return 0

@@ -159,5 +159,10 @@ def check_same_recording(refinement: Refinement, recording: Recording) -> None:
     t, first = refinement.trajectory.t_s, 0 if refinement.view is None else refinement.view.first_frame
     frames = recording.frame_t_s[first:first + len(t)]
     if len(frames) != len(t) or np.abs(frames - t).max() > SAME_FRAME_S:
-        raise RecordingError(f"recording {recording.name} does not have the frames of the trajectory of "
-                             f"{refinement.name}; give the recording that was refined")
+        raise another_recording(refinement, recording)
+
+
+def another_recording(refinement: Refinement, recording: Recording) -> RecordingError:
+    """That a recording is not the one that was refined."""
+    return RecordingError(f"recording {recording.name} does not have the frames of the trajectory of "
+                          f"{refinement.name}; give the recording that was refined")

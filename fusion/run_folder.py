@@ -89,6 +89,18 @@ def read_run(folder: str | Path) -> Run:
         FormatError: a file is missing or not what it claims.
     """
     folder = Path(folder)
+    summary = read_summary(folder)
+    refined, motions_only = read_tum(folder / "trajectory.tum"), read_tum(folder / "motions_only.tum")
+    return Run(folder.resolve().name, refined, motions_only, summary)
+
+
+def read_summary(folder: str | Path) -> dict[str, Any]:
+    """The `summary.json` of a run folder.
+
+    Raises:
+        FormatError: it is missing or not what it claims.
+    """
+    folder = Path(folder)
     path = folder / "summary.json"
     try:
         summary = json.loads(path.read_text(encoding="utf-8"))
@@ -98,8 +110,7 @@ def read_run(folder: str | Path) -> Run:
         raise FormatError(f"{folder.name}/summary.json: not valid JSON ({error}); write the run again") from None
     if not isinstance(summary, dict) or summary.get("schema") != 1:
         raise FormatError(f"{folder.name}/summary.json: not a summary of schema 1; write the run again")
-    refined, motions_only = read_tum(folder / "trajectory.tum"), read_tum(folder / "motions_only.tum")
-    return Run(folder.resolve().name, refined, motions_only, summary)
+    return summary
 
 
 def _write_states(r: Refinement, path: Path) -> None:

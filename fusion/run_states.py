@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusion.camera_imu import UNKNOWN, CameraImu, read_camera_imu
+from fusion.frame_blocks import FrameBlock
 from fusion.joint import JointSamples
 from fusion.result import ImuConclusion, OnlineConclusion, Refinement, ScaleConclusion, View
 from vio import se3
@@ -76,15 +77,42 @@ def read_refinement(folder: str | Path) -> Refinement:
     except (VioError, *UNREADABLE) as error:
         reason = (str(error).splitlines() or [type(error).__name__])[0]
         raise FormatError(f"{name}: {reason}; {AGAIN}") from None
-    return _refinement(folder, run.summary, run.motions_only, trajectory, states, arrays, joint, view, inertial)
+    truth = read_tum(folder / "truth.tum") if (folder / "truth.tum").is_file() else None
+    filtered = read_tum(folder / "filtered.tum") if run.summary.get("online") else None
+    return _refinement(folder.name, run.summary, (trajectory, run.motions_only, truth, filtered), states,
+                       arrays["rejected"], joint, view, inertial)
 
 
-def _refinement(folder: Path, summary: dict[str, Any], motions_only: Trajectory, trajectory: Trajectory,
-                states: dict[str, Array], arrays: dict[str, Any], joint: JointSamples | None,
+def read_header(folder: Path, summary: dict[str, Any], first: FrameBlock, m: int) -> Refinement:
+    """The conclusions of a run folder of M frames, with the states of its first frame alone.
+
+    Raises:
+        FormatError: a file is missing, damaged, or not what it claims.
+    """
+    name = f"{folder.name}/trajectory.npz"
+    try:
+        with (folder / "trajectory.npz").open("rb") as file, np.load(file, allow_pickle=False) as archive:
+            arrays = {key: archive[key] for key in archive.files if key not in {"t", "T_world_body", "cov", *SHAPES}}
+        joint, view, inertial = _joint(arrays, m), _view(arrays), _inertial(arrays)
+        rejected = arrays["rejected"]
+    except KeyError as error:
+        raise FormatError(f"{name}: missing key {error}; {AGAIN}") from None
+    except (OSError, VioError, *UNREADABLE) as error:
+        reason = (str(error).splitlines() or [type(error).__name__])[0]
+        raise FormatError(f"{name}: {reason}; {AGAIN}") from None
+    states = {"velocity": np.zeros((1, 3)), "gyro_bias": first.gyro_bias_rad_s, "accel_bias": first.accel_bias_m_s2,
+              "log_scale": first.log_scale, "log_scale_sd": first.log_scale_sd}
+    trajectories = first.refined, first.motions_only, first.truth, first.refined
+    return _refinement(folder.name, summary, trajectories, states, rejected, joint, view, inertial)
+
+
+def _refinement(folder: str, summary: dict[str, Any],
+                trajectories: tuple[Trajectory, Trajectory, Trajectory | None, Trajectory | None],
+                states: dict[str, Array], rejected: Any, joint: JointSamples | None,
                 view: View | None, inertial: InertialLevels | None) -> Refinement:
-    truth = folder / "truth.tum"
+    """A refinement of what was read; trajectories are refined, motions alone, truth, and filtered where online."""
+    trajectory, motions_only, truth, filtered = trajectories
     online = summary.get("online", {})
-    filtered = read_tum(folder / "filtered.tum") if online else None
     try:
         imu, scale, motions = summary["imu"], summary["scale"], summary["motions"]
         gaps = tuple(Gap(float(gap["start_s"]), float(gap["end_s"])) for gap in imu["gaps"])
@@ -95,19 +123,19 @@ def _refinement(folder: Path, summary: dict[str, Any], motions_only: Trajectory,
             motions_only=motions_only,
             scale=ScaleConclusion(scale["policy"], float(scale["log_mean"]), float(scale["log_sd"]), scale["reason"]),
             imu=ImuConclusion(imu["chi2_per_dof"], float(imu["inflation"]), gaps), motions_used=int(motions["used"]),
-            rejected=np.asarray(arrays["rejected"], np.int64), bridged=int(motions.get("bridged", 0)),
-            time_offset_s=float(summary["time_offset_s"]), truth=read_tum(truth) if truth.is_file() else None,
+            rejected=np.asarray(rejected, np.int64), bridged=int(motions.get("bridged", 0)),
+            time_offset_s=float(summary["time_offset_s"]), truth=truth,
             camera_imu=_camera_imu(summary), motion_noise=(float(motions.get("rotation_noise", 1.0)),
                                                            float(motions.get("translation_noise", 1.0))),
             timing_s=dict(summary["timing_s"]), peak_rss_bytes=int(summary["peak_rss_bytes"]), joint=joint, view=view,
             inertial=inertial,
-            online=None if filtered is None else OnlineConclusion(
+            online=None if filtered is None or not online else OnlineConclusion(
                 float(online["lag_s"]), dict(online["latency_ms"]), int(online["resets"]), filtered),
         )
     except KeyError as error:
-        raise FormatError(f"{folder.name}: summary.json or trajectory.npz lacks {error}; {AGAIN}") from None
+        raise FormatError(f"{folder}: summary.json or trajectory.npz lacks {error}; {AGAIN}") from None
     except (TypeError, ValueError) as error:
-        raise FormatError(f"{folder.name}/summary.json: not as a run writes it ({error}); {AGAIN}") from None
+        raise FormatError(f"{folder}/summary.json: not as a run writes it ({error}); {AGAIN}") from None
 
 
 def _camera_imu(summary: dict[str, Any]) -> CameraImu:

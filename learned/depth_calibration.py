@@ -76,7 +76,8 @@ def pixel_errors(measured: Sequence[Measured], scale_log_mean: float, rng: np.ra
         scale_log_mean: ln(metres per motion unit) of the prior.
         rng: draws `PIXELS_PER_IMAGE` of every image; None takes all.
     """
-    error, common, rows, number = [np.zeros(0)], [np.zeros(0)], [np.zeros((0, len(PIXEL_SIGNALS)))], []
+    error, common, image, rows = [np.zeros(0)], [np.zeros(0)], [np.zeros(0)], [np.zeros((0, len(PIXEL_SIGNALS)))]
+    number: list[NDArray[np.int64]] = []
     for r, m in enumerate(measured):
         if m.depth_true_m is None:
             continue
@@ -91,9 +92,10 @@ def pixel_errors(measured: Sequence[Measured], scale_log_mean: float, rng: np.ra
                 taken = np.sort(rng.choice(len(index), PIXELS_PER_IMAGE, replace=False))
             error.append(off[taken] - scale)
             common.append(np.full(len(taken), scale - scale_log_mean))
+            image.append(np.full(len(taken), scale - m.log_scale))
             rows.append(signals.reshape(len(PIXEL_SIGNALS), -1)[:, index[taken]].T.astype(float))
             number.append(np.full(len(taken), r, np.int64))
-    return PixelErrors(np.concatenate(error), np.concatenate(common), np.concatenate(rows),
+    return PixelErrors(np.concatenate(error), np.concatenate(common), np.concatenate(image), np.concatenate(rows),
                        np.concatenate(number) if number else np.zeros(0, np.int64))
 
 

@@ -1,9 +1,10 @@
 """How wrong a predicted depth is, per pixel: a standard deviation of its logarithm.
 
-The error of a depth map has two parts. One is shared by the whole image, its scale. The other differs from pixel to
-pixel; its ln sd is linear in a few `PIXEL_SIGNALS`, fitted by Gaussian maximum likelihood to calibration recordings, so
-that sd² is the mean square of the error. Errors have heavier tails than a Gaussian, so the factor from sd to the 95 %
-interval is measured too.
+The error of a depth map has two parts. One is shared by the whole image, its scale: part of that is the scale of the
+recording's motions, which depth follows and an IMU can measure, part is the image's own. The other differs from pixel
+to pixel; its ln sd is linear in a few `PIXEL_SIGNALS`, fitted by Gaussian maximum likelihood to calibration
+recordings, so that sd² is the mean square of the error. Errors have heavier tails than a Gaussian, so the factor from
+sd to the 95 % interval is measured too.
 """
 
 from __future__ import annotations
@@ -51,13 +52,17 @@ class DepthUncertainty:
     """Root mean square of what a whole image is off at the prior scale; its pixels share it, averaging keeps it."""
     prior_interval_95: float
     """Half-width of the 95 % interval at the prior scale over `sqrt(sd² + common_log_sd²)`."""
+    image_log_sd: float | None = None
+    """Root mean square of what a whole image is off once the scale of its recording's motions is right: what remains
+    of `common_log_sd` where the scale was measured. None in cards that were calibrated before it was."""
 
     def __post_init__(self) -> None:
         count = len(self.signals)
-        numbers = np.concatenate([np.ravel(self.mean), np.ravel(self.sd), np.ravel(self.log_sd),
-                                  [self.interval_95, self.common_log_sd, self.prior_interval_95]])
+        single = [self.interval_95, self.common_log_sd, self.prior_interval_95]
+        single += [] if self.image_log_sd is None else [self.image_log_sd]
+        numbers = np.concatenate([np.ravel(self.mean), np.ravel(self.sd), np.ravel(self.log_sd), single])
         shapes = (self.mean.shape, self.sd.shape, self.log_sd.shape)
-        positive = min(self.interval_95, self.common_log_sd, self.prior_interval_95, *self.sd) > 0
+        positive = min(*single, *self.sd) > 0
         unknown = set(self.signals) - set(PIXEL_SIGNALS)
         if shapes != ((count,), (count,), (1 + count,)) or unknown or not np.isfinite(numbers).all() or not positive:
             raise WeightsError(f"weights: the depth uncertainty for signals {', '.join(self.signals) or 'none'} has "
@@ -83,8 +88,13 @@ class DepthUncertainty:
     def to_dict(self) -> dict[str, Any]:
         """In values that JSON can hold."""
         return {"signals": list(self.signals), "mean": self.mean.tolist(), "sd": self.sd.tolist(),
-                "log_sd": self.log_sd.tolist(), "interval_95": self.interval_95,
-                "common_log_sd": self.common_log_sd, "prior_interval_95": self.prior_interval_95}
+                "log_sd": self.log_sd.tolist(), **self.intervals()}
+
+    def intervals(self) -> dict[str, float]:
+        """What whoever reads sd maps needs beside them; `image_log_sd` only where it is known."""
+        known = {} if self.image_log_sd is None else {"image_log_sd": self.image_log_sd}
+        return {"interval_95": self.interval_95, "common_log_sd": self.common_log_sd,
+                "prior_interval_95": self.prior_interval_95, **known}
 
 
 def depth_uncertainty_from_dict(values: Mapping[str, Any]) -> DepthUncertainty:
@@ -96,7 +106,8 @@ def depth_uncertainty_from_dict(values: Mapping[str, Any]) -> DepthUncertainty:
     try:
         mean, sd, log_sd = (np.array(values[key], float) for key in ("mean", "sd", "log_sd"))
         return DepthUncertainty(tuple(values["signals"]), mean, sd, log_sd, float(values["interval_95"]),
-                                float(values["common_log_sd"]), float(values["prior_interval_95"]))
+                                float(values["common_log_sd"]), float(values["prior_interval_95"]),
+                                float(values["image_log_sd"]) if "image_log_sd" in values else None)
     except (KeyError, TypeError, ValueError):
         raise WeightsError("weights: the card's depth uncertainty is incomplete; calibrate again") from None
 
@@ -109,6 +120,8 @@ class PixelErrors:
     """(P,) ln(true / predicted) once the image's scale is right."""
     common: Array
     """(P,) ln of the image's scale over the prior's."""
+    image: Array
+    """(P,) ln of the image's scale over that of its recording's motions; NaN where nothing moved."""
     signals: Array
     """(P, S) all `PIXEL_SIGNALS`."""
     recording: NDArray[np.int64]
@@ -116,7 +129,8 @@ class PixelErrors:
 
     def part(self, mask: NDArray[np.bool_]) -> PixelErrors:
         """Some of the pixels."""
-        return PixelErrors(self.error[mask], self.common[mask], self.signals[mask], self.recording[mask])
+        return PixelErrors(self.error[mask], self.common[mask], self.image[mask], self.signals[mask],
+                           self.recording[mask])
 
 
 def fit_depth_uncertainty(pixels: PixelErrors, chosen: Sequence[str]) -> DepthUncertainty:
@@ -139,8 +153,9 @@ def fit_depth_uncertainty(pixels: PixelErrors, chosen: Sequence[str]) -> DepthUn
     sd, common = np.exp(design @ log_sd), float(np.sqrt(np.mean(pixels.common**2)))
     whole = np.abs(pixels.error + pixels.common) / np.hypot(sd, common)
     factors = np.quantile(np.abs(pixels.error) / sd, LEVEL), np.quantile(whole, LEVEL)
+    image = pixels.image[np.isfinite(pixels.image)]
     return DepthUncertainty(tuple(chosen), mean, spread, log_sd, float(factors[0]), max(common, 1e-6),
-                            float(factors[1]))
+                            float(factors[1]), max(float(np.sqrt(np.mean(image**2))), 1e-6) if len(image) else None)
 
 
 def choose_pixel_signals(pixels: PixelErrors) -> tuple[list[str], dict[str, float]]:

@@ -113,9 +113,7 @@ class NetworkPredictor:
     def depth_uncertainty_card(self) -> Mapping[str, Any] | None:
         """What is needed beside `log_depth_sd`; see `learned.predictor.JudgesDepth`."""
         model = self.depth_uncertainty
-        return None if model is None else {
-            "interval_95": model.interval_95, "common_log_sd": model.common_log_sd,
-            "prior_interval_95": model.prior_interval_95, "signals": list(model.signals)}
+        return None if model is None else {**model.intervals(), "signals": list(model.signals)}
 
     @cached_property
     def _angle(self) -> torch.Tensor:

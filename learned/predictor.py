@@ -76,7 +76,8 @@ class JudgesDepth(Protocol):
     @property
     def depth_uncertainty_card(self) -> Mapping[str, Any] | None:
         """None where it cannot say. Otherwise `interval_95` (half-width over sd, at the image's own scale),
-        `common_log_sd` (of a whole image at the prior scale) and `prior_interval_95` (over both together)."""
+        `common_log_sd` (of a whole image at the prior scale), `prior_interval_95` (over both together) and, where it
+        is known, `image_log_sd` (of a whole image at the true scale of the recording's motions)."""
 
     def log_depth_sd(self, frames: torch.Tensor, z_depth: torch.Tensor) -> torch.Tensor | None:
         """Standard deviation (B, h, w) of ln depth, pixel by pixel, once an image's scale is right.

@@ -265,6 +265,15 @@ def test_images_are_simulated_and_inspected(tmp_path, capsys):
     plain, rendered = (open_recording(tmp_path / name) for name in ("PLAIN", "REC"))
     np.testing.assert_array_equal(plain.truth.T_world_body, rendered.truth.T_world_body)  # one motion drives both
     np.testing.assert_array_equal(plain.imu.accel_m_s2, rendered.imu.accel_m_s2)
+    for spoil, words in ((lambda content: content[:len(content) // 2], "image files are cut off, the first is that of"),
+                         (lambda content: content[:16] + (3840).to_bytes(4, "big") + (2160).to_bytes(4, "big")
+                          + content[24:], "3840 x 2160 pixels but the calibration is for 64 x 64")):
+        image = rendered.frame_paths[0]
+        whole = image.read_bytes()
+        image.write_bytes(spoil(whole))
+        assert main(["inspect", str(tmp_path / "REC")]) == 0
+        assert words in capsys.readouterr().out
+        image.write_bytes(whole)
 
 
 @pytest.mark.parametrize(("change", "word"), [

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -18,6 +19,7 @@ from vio.recording import Recording
 PREDICTION = "prediction.json"
 """Marks maps that a network predicted, one for every frame, metric at the prior scale."""
 SD_FOLDER, SD_UNIT_KEY = "sd", "log_depth_sd_unit"
+LARGEST_IMAGE_LOG_SD = 5.0
 NS = 1e-9
 
 
@@ -37,6 +39,9 @@ class DepthFolder:
     """Stamp of the recording's first frame."""
     log_sd_unit: float | None = None
     """Sd of ln depth per count of the maps in `sd/` beside; None where there are none."""
+    image_log_sd: float | None = None
+    """Sd of the ln scale that all pixels of one image are off by, once the scale of the motions is right; None where
+    nothing says."""
 
     def depth_m(self, t_s: float) -> NDArray[np.float32] | None:
         """z-depth (H, W) [m] of the frame at a time after the first frame, 0 where unknown; None when not mapped.
@@ -91,7 +96,7 @@ def read_depth_folder(folder: str | Path, recording: Recording | None = None) ->
                           "recording too")
     start_ns = int(t_ns[0]) if recording is None else int(recording.frame_t_ns[0])
     return DepthFolder(folder.resolve().name, t_ns, files, encoding or LinearDepth(unit_m), predicted, start_ns,
-                       _log_sd_unit(folder))
+                       _log_sd_unit(folder), _image_log_sd(folder / PREDICTION) if predicted else None)
 
 
 def _log_sd_unit(folder: Path) -> float | None:
@@ -102,3 +107,20 @@ def _log_sd_unit(folder: Path) -> float | None:
     if not 0 < unit < 1:
         raise CalibrationError(f"sensor.yaml: {SD_UNIT_KEY} is {unit:g}; must be between 0 and 1, such as 1e-4")
     return unit
+
+
+def _image_log_sd(path: Path) -> float | None:
+    """Weights that were not calibrated for it say how far images are off at the prior scale, which is more."""
+    remedy = "predict the depth again"
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        raise FormatError(f"{path.name}: not valid JSON; {remedy}") from None
+    said = content.get("depth_uncertainty") if isinstance(content, dict) else None
+    value = said.get("image_log_sd", said.get("common_log_sd")) if isinstance(said, dict) else None
+    if value is None:
+        return None
+    if isinstance(value, bool) or not isinstance(value, (int, float)) or not 0 < value < LARGEST_IMAGE_LOG_SD:
+        raise FormatError(f"{path.name}: the sd of an image's ln scale is {value!r}; must be a number between 0 and "
+                          f"{LARGEST_IMAGE_LOG_SD:g}; {remedy}")
+    return float(value)

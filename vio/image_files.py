@@ -64,6 +64,18 @@ def quiet_decoder() -> Iterator[None]:
         logging.setLogLevel(level)
 
 
+def is_cut_off(path: Path) -> bool:
+    """Whether a PNG or JPEG lacks its end, from its first and last bytes alone; False for files that cannot be read."""
+    try:
+        with path.open("rb") as file:
+            start = file.read(4)
+            file.seek(max(path.stat().st_size - 64, 0))
+            last = file.read()
+    except OSError:
+        return False
+    return not start or any(start.startswith(magic) and end not in last for magic, end in ENDS.items())
+
+
 def size_of(path: Path, what: str) -> tuple[int, int]:
     """Width and height of an image file, from its header where the header is a known one.
 

@@ -8,7 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from vio.errors import VioError
+from vio.errors import RecordingError, VioError
+from vio.image_files import is_cut_off, size_of
 from vio.imu import find_gaps
 from vio.imu_checks import ImuReport, check_imu
 from vio.recording import Recording, check_refinable
@@ -124,12 +125,31 @@ def _images(recording: Recording) -> Check:
     listed = [path for path in recording.frame_paths if path is not None]
     there = sum(path.is_file() for path in listed)
     if there == len(recording):
-        return Check("images", "ok", f"all {there} image files exist")
+        return _whole_images(recording)
     if there == 0:
         return Check("images", "warning", "no image files: refinement with given motions works, prediction does not",
                      "to predict, put the files that cam0/data.csv lists into cam0/data")
     return Check("images", "warning", f"{there} of {len(recording)} image files exist; prediction needs all",
                  "copy the missing ones, or cut cam0/data.csv to frames that exist")
+
+
+def _whole_images(recording: Recording) -> Check:
+    """Whether image files that all exist are whole, and of the size that the camera was calibrated for."""
+    count, camera = len(recording), recording.calibration.camera
+    cut = [k for k, path in enumerate(recording.frame_paths) if path is not None and is_cut_off(path)]
+    if cut:
+        return Check("images", "warning", f"{len(cut)} of {count} image files are cut off, the first is that of frame "
+                     f"{cut[0]}", "copy them again; until then predict leaves these frames' motions out")
+    first = recording.frame_paths[0]
+    try:
+        size = None if first is None else size_of(first, "frame 0")
+    except RecordingError as error:
+        return Check("images", "warning", str(error), "restore the files; until then they cannot be predicted on")
+    if camera is not None and size is not None and size != (camera.width, camera.height):
+        return Check("images", "warning", f"the images have {size[0]} x {size[1]} pixels but the calibration is for "
+                     f"{camera.width} x {camera.height}", "give the calibration of this resolution: prediction and "
+                     "lesions' pixels need it")
+    return Check("images", "ok", f"all {count} image files exist")
 
 
 def _imu(recording: Recording) -> list[Check]:

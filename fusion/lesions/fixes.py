@@ -8,9 +8,11 @@ z-depth d = exp(s) d_units, the point is
 To first order, for a right perturbation (ω, ρ) of the pose, δs of the log scale, δl of the log depth, δu of
 the pixel:
 
-    δx = R (ρ - [x_b]× ω) + R R_bc r d (δs + δl) + d R R_bc (∂r/∂u) δu.
+    δx = R (ρ - [x_b]× ω) + R R_bc r d (δs + δm + δl) + d R R_bc (∂r/∂u) δu.
 
 Pose and scale are correlated, for a scale error also moves the pose: their joint covariance enters, not their sum.
+δm is what a predicted map is off as a whole once s is right: neighbouring images share it (`merging.py`), while δl is
+the pixel's own.
 """
 
 from __future__ import annotations
@@ -55,6 +57,8 @@ class Fix:
     """(3, 3) from pose and scale, which other sightings share in part."""
     own_cov: Array
     """(3, 3) from depth and pixel, of this sighting alone."""
+    image_m: Array
+    """(3,) error that one standard deviation of its depth map's own scale makes; zero where that is exact."""
     common_m: Array
     """(S, 3) sampled errors from pose and scale."""
     with_depth: bool
@@ -75,6 +79,12 @@ class DepthSource:
     def predicted(self) -> bool:
         """Whether depth is metric at the prior scale only, and follows the refined scale."""
         return self.folder is not None and self.folder.predicted
+
+    @property
+    def image_log_sd(self) -> float:
+        """Sd of the ln scale of a whole map beyond the motions' scale; zero where the user gave one sd for all."""
+        known = None if self.folder is None or self.relative_sd is not None else self.folder.image_log_sd
+        return known or 0.0
 
     def map_of(self, frame: int, t_s: float) -> NDArray[np.float32] | None:
         """Depth map of a frame of the recording, or None."""
@@ -103,7 +113,8 @@ def place_sighting(refinement: Refinement, sighting: Sighting, index: int, view:
     depth_m, note = _depth(refinement, sighting, index, view, depth, pixel)
     if depth_m is None or view is None or view.camera is None or pixel is None:
         offset = np.zeros(3) if view is None else view.T_body_camera[:3, 3]
-        return _fix(refinement, sighting, index, offset, np.zeros(3), np.eye(3) * VIEW_SD_M**2, note)
+        nothing = np.zeros(3)
+        return _fix(refinement, sighting, index, offset, nothing, np.eye(3) * VIEW_SD_M**2, nothing, note)
     ray, slope = _ray(view.camera, pixel)
     R_bc, t_bc = view.T_body_camera[:3, :3], view.T_body_camera[:3, 3]
     R = refinement.trajectory.rotations[index]
@@ -112,17 +123,18 @@ def place_sighting(refinement: Refinement, sighting: Sighting, index: int, view:
     relative_sd = depth.relative_sd_at(float(refinement.trajectory.t_s[index]), pixel)
     own = R @ (relative_sd**2 * np.outer(along, along) + PIXEL_SD**2 * aside @ aside.T) @ R.T
     scaled = along if depth.predicted else np.zeros(3)
-    return _fix(refinement, sighting, index, along + t_bc, scaled, own, "")
+    return _fix(refinement, sighting, index, along + t_bc, scaled, own, depth.image_log_sd * (R @ along), "")
 
 
 def _fix(refinement: Refinement, sighting: Sighting, index: int, x_body: Array, scaled: Array, own: Array,
-         note: str) -> Fix:
+         image: Array, note: str) -> Fix:
     T = refinement.trajectory.T_world_body[index]
     R = T[:3, :3]
     J = np.hstack([-R @ se3.skew(x_body), R, (R @ scaled)[:, None]])
     pose_cov = J @ pose_and_scale_covariance(refinement, index) @ J.T
     common = _common(refinement.joint, refinement.trajectory.rotations, index, R @ x_body, R @ scaled)
-    return Fix(sighting, index, R @ x_body + T[:3, 3], 0.5 * (pose_cov + pose_cov.T), own, common, not note, note)
+    return Fix(sighting, index, R @ x_body + T[:3, 3], 0.5 * (pose_cov + pose_cov.T), own, image, common, not note,
+               note)
 
 
 def pose_and_scale_covariance(refinement: Refinement, index: int) -> Array:

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusion.report.aligned import Scene, TruthErrors, thin
+from fusion.report.kept import even_frames
 from fusion.result import Refinement
 
 Array = NDArray[np.float64]
@@ -49,7 +50,7 @@ def trajectory_figure(scene: Scene) -> Figure:
     data.append(points3(scene.refined_m[:1], "start", "circle", "--refined", 6, factor) | {"showlegend": False})
     data.append(points3(scene.refined_m[-1:], "end", "diamond", "--refined", 6, factor) | {"showlegend": False})
     if scene.rejected_frames is not None and len(scene.rejected_frames):
-        at = scene.rejected_frames[_every(len(scene.rejected_frames))]
+        at = scene.rejected_frames[even_frames(len(scene.rejected_frames), LIMIT)]
         data.append(points3(scene.refined_m[at], "motion rejected", "square", "--rejected", 3, factor))
     axes = {f"{axis}axis": {"title": {"text": f"{axis} [{unit}]"}, "backgroundcolor": "--panel", "gridcolor": "--grid",
                             "zerolinecolor": "--grid", "color": "--muted", "showspikes": False}
@@ -153,14 +154,14 @@ def line(t_s: Array, values: Array, name: str, colour: str, width: float) -> Fig
 
 def rejected_ticks(t_s: Array) -> Figure:
     """Marks on the time axis where motions were rejected."""
-    at = t_s[_every(len(t_s))]
+    at = t_s[even_frames(len(t_s), LIMIT)]
     return {"type": "scatter", "mode": "markers", "name": "motion rejected", "x": numbers(at), "y": [0] * len(at),
             "hoverinfo": "skip", "cliponaxis": False,
             "marker": {"symbol": "line-ns-open", "size": 9, "color": "--rejected", "line": {"width": 1.5}}}
 
 
 def _line3(points_m: Array, t_s: Array, name: str, colour: str, width: float, unit: str, factor: float) -> Figure:
-    keep = _every(len(points_m))
+    keep = even_frames(len(points_m), LIMIT)
     hover = f"{name}<br>%{{customdata:.2f}} s<br>%{{x:.4g}}, %{{y:.4g}}, %{{z:.4g}} {unit}<extra></extra>"
     return _xyz(points_m[keep], factor) | {
         "mode": "lines", "name": name, "customdata": numbers(t_s[keep]), "hovertemplate": hover,
@@ -175,11 +176,6 @@ def points3(points_m: Array, name: str, symbol: str, colour: str, size: float, f
 
 def _xyz(points_m: Array, factor: float) -> Figure:
     return {"type": "scatter3d"} | {axis: numbers(points_m[:, k] * factor) for k, axis in enumerate("xyz")}
-
-
-def _every(n: int) -> NDArray[np.int64]:
-    """At most `LIMIT` indices out of n, evenly spread, with both ends."""
-    return np.unique(np.linspace(0, n - 1, min(n, LIMIT)).round().astype(np.int64))
 
 
 def numbers(values: Array) -> list[float | None]:

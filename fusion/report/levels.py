@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from fusion.report import figures
 from fusion.report.aligned import Scene
 from fusion.report.figures import Figure
+from fusion.report.kept import even_frames
 from vio.inertial_levels import InertialLevels
 
 Array = NDArray[np.float64]
@@ -19,8 +20,10 @@ SPANS = 1000
 
 def speed_figure(scene: Scene, gaps: Sequence[tuple[float, float]]) -> Figure:
     """Length of the track per second, refined and of the motions alone, with the motions that were rejected."""
-    t, refined = spans_speed(scene.t_s, scene.refined_m)
-    _, motions = spans_speed(scene.t_s, scene.motions_m)
+    kept = scene.kept
+    rows = kept.rows_of(even_frames(kept.count, SPANS + 1))
+    t, refined = spans_speed(scene.t_s[rows], kept.way_m[rows])
+    _, motions = spans_speed(scene.t_s[rows], kept.motions_way_m[rows])
     data = [figures.line(t, 1e3 * motions, "motions alone", "--motions", 1.4),
             figures.line(t, 1e3 * refined, "refined", "--refined", 1.8)]
     if scene.rejected_frames is not None and len(scene.rejected_frames):
@@ -28,13 +31,12 @@ def speed_figure(scene: Scene, gaps: Sequence[tuple[float, float]]) -> Figure:
     return {"data": data, "layout": figures.time_layout("speed [mm/s]", scene.t_s, gaps, zero=True)}
 
 
-def spans_speed(t_s: Array, points_m: Array) -> tuple[Array, Array]:
-    """Centres (B,) of at most `SPANS` spans of frames [s], and the mean speed in each [m/s]."""
+def spans_speed(t_s: Array, way_m: Array) -> tuple[Array, Array]:
+    """Centres (B,) of the spans between B + 1 times [s], and the mean speed (B,) in each [m/s], from the way up to
+    those times."""
     if len(t_s) < 2:
         return t_s, np.zeros(len(t_s))
-    edges = np.unique(np.linspace(0, len(t_s) - 1, min(SPANS + 1, len(t_s))).round().astype(np.int64))
-    way = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(points_m, axis=0), axis=1))])
-    return 0.5 * (t_s[edges[1:]] + t_s[edges[:-1]]), np.diff(way[edges]) / np.diff(t_s[edges])
+    return 0.5 * (t_s[1:] + t_s[:-1]), np.diff(way_m) / np.diff(t_s)
 
 
 def rate_figure(levels: InertialLevels, gaps: Sequence[tuple[float, float]]) -> Figure:

@@ -10,6 +10,9 @@ from pathlib import Path
 from string import Template
 from typing import Any
 
+import numpy as np
+
+from fusion.frame_blocks import FrameSource
 from fusion.report import figures, sections, words
 from fusion.report.aligned import Scene, make_scene
 from fusion.report.levels import rate_figure, speed_figure, vibration_figure
@@ -17,7 +20,7 @@ from fusion.report.pictures import picture_gallery
 from fusion.report.plot import trajectory_svg
 from fusion.report.tube import tube_figure
 from fusion.report.unrolled import lesion_table, space_marks, unrolled_figure
-from fusion.result import Refinement, check_same_recording
+from fusion.result import SAME_FRAME_S, Refinement, another_recording
 from vio.atomic import atomic_write
 from vio.motions import RelativeMotions
 from vio.recording import Recording
@@ -30,13 +33,14 @@ TUBE = " The tube holds the body with 95 %, as claimed relative to the first pos
 
 
 def write_report(
-    refinement: Refinement, summary: Mapping[str, Any], path: str | Path, motions: RelativeMotions | None = None,
-    lesions: Sequence[Mapping[str, Any]] | None = None, recording: Recording | None = None,
+    refinement: Refinement | FrameSource, summary: Mapping[str, Any], path: str | Path,
+    motions: RelativeMotions | None = None, lesions: Sequence[Mapping[str, Any]] | None = None,
+    recording: Recording | None = None,
 ) -> None:
     """Write the page, atomically.
 
     Args:
-        refinement: what was concluded.
+        refinement: what was concluded; a run folder as `fusion.run_stream.RunFrames` is read in constant memory.
         summary: as in `summary.json` (docs/conventions.md); figures of accuracy are taken from here.
         path: the file.
         motions: the motions it was made from; they place the rejected ones where pairs are not all neighbours.
@@ -44,16 +48,17 @@ def write_report(
         recording: the recording that was refined; lesions then come with pictures of the frames that show them.
 
     Raises:
+        FormatError: frames of a run folder that cannot be read.
         OutputError: the file cannot be written.
         RecordingError: the recording is not the one that was refined, or one of its images is cut off or undecodable.
     """
     from plotly.offline import get_plotlyjs  # heavy, and needed only once a page is written
 
+    scene = make_scene(refinement, motions)
     if recording is not None:
-        check_same_recording(refinement, recording)
-
+        _check_same(scene, recording)
     page = Template(_asset("page.html")).substitute(
-        _content(refinement, summary, make_scene(refinement, motions), lesions or (), recording),
+        _content(scene, summary, lesions or (), recording),
         style=_asset("page.css"), script=_asset("page.js"), plotly=get_plotlyjs(),
     )
     with atomic_write(path) as file:
@@ -64,15 +69,25 @@ def _asset(name: str) -> str:
     return files(__package__).joinpath(name).read_text(encoding="utf-8")
 
 
-def _content(refinement: Refinement, summary: Mapping[str, Any], scene: Scene,
-             lesions: Sequence[Mapping[str, Any]], recording: Recording | None) -> dict[str, str]:
+def _check_same(scene: Scene, recording: Recording) -> None:
+    """`check_same_recording`, by the frames that were kept."""
+    refinement, frame, count = scene.kept.refinement, scene.kept.frame, scene.kept.count
+    first = 0 if refinement.view is None else refinement.view.first_frame
+    t_s = recording.frame_t_s[first:first + count]
+    if len(t_s) != count or np.abs(t_s[frame] - scene.t_s).max() > SAME_FRAME_S:
+        raise another_recording(refinement, recording)
+
+
+def _content(scene: Scene, summary: Mapping[str, Any], lesions: Sequence[Mapping[str, Any]],
+             recording: Recording | None) -> dict[str, str]:
+    refinement, kept = scene.kept.refinement, scene.kept
     verdict = words.verdict(refinement, summary)
     within = None if scene.errors is None else scene.errors.within_3_sigma
-    facts = words.sentences(refinement, summary, within)
+    facts = words.sentences(refinement, summary, within, (kept.mean_gyro_bias_rad_s, kept.mean_accel_bias_m_s2))
     drawn = _figures(refinement, scene, lesions)
     return {
         "name": escape(refinement.name),
-        "facts_line": escape(_facts_line(refinement, summary)),
+        "facts_line": escape(_facts_line(scene, summary)),
         "tone": verdict.tone,
         "verdict": escape(verdict.text),
         "tiles": sections.tiles(refinement, summary, scene),
@@ -96,7 +111,7 @@ def _figures(refinement: Refinement, scene: Scene,
     t = refinement.trajectory.t_s
     rejected = None if scene.rejected_frames is None else t[scene.rejected_frames]
     space = figures.trajectory_figure(scene)
-    out = [("trajectory", "Trajectory", _trajectory_caption(refinement, scene), space)]
+    out = [("trajectory", "Trajectory", _trajectory_caption(scene), space)]
     space["data"] += tube_figure(scene, figures.space_unit(scene)[1])
     if lesions:
         space["data"] += space_marks(lesions, scene.T_scene_world, figures.space_unit(scene)[1])
@@ -127,7 +142,7 @@ def _figures(refinement: Refinement, scene: Scene,
     return out
 
 
-def _trajectory_caption(refinement: Refinement, scene: Scene) -> str:
+def _trajectory_caption(scene: Scene) -> str:
     where = "in the estimator's world: z up, position and yaw counted from the first pose"
     if scene.errors is not None:
         where = f"both estimates laid over truth {words.SHORT_MODES[scene.errors.mode]}"
@@ -135,7 +150,7 @@ def _trajectory_caption(refinement: Refinement, scene: Scene) -> str:
     if scene.claimed_cov_m2 is not None:
         text += TUBE
     if len(scene.t_s) > figures.LIMIT:
-        text += f" {figures.LIMIT:,} of {len(scene.t_s):,} poses are drawn."
+        text += f" {figures.LIMIT:,} of {scene.kept.count:,} poses are drawn."
     return text
 
 
@@ -149,9 +164,10 @@ def _marks(refinement: Refinement, placed: bool) -> str:
     return " ".join(parts)
 
 
-def _facts_line(refinement: Refinement, summary: Mapping[str, Any]) -> str:
-    return (f"{len(refinement.trajectory):,} frames · {words.duration(float(summary['duration_s']))} · "
-            f"path {words.length(float(summary['path_length_m']))} · {words.ESTIMATORS[refinement.estimator]}")
+def _facts_line(scene: Scene, summary: Mapping[str, Any]) -> str:
+    estimator = words.ESTIMATORS[scene.kept.refinement.estimator]
+    return (f"{scene.kept.count:,} frames · {words.duration(float(summary['duration_s']))} · "
+            f"path {words.length(float(summary['path_length_m']))} · {estimator}")
 
 
 def _section(key: str, title: str, caption: str) -> str:

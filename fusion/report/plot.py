@@ -147,7 +147,8 @@ def _time_panel(scene: Scene) -> list[str]:
     if scene.rejected_frames is not None and len(scene.rejected_frames):
         x, _ = panel.at(scene.t_s[scene.rejected_frames], np.zeros(1))
         marks = "".join(f"M{a:.1f},596v6" for a in np.unique(x.round(1)).tolist())
-        note = f'<text x="942" y="442" text-anchor="end">{len(x):,} motions rejected, marked below</text>'
+        count = len(scene.kept.refinement.rejected)
+        note = f'<text x="942" y="442" text-anchor="end">{count:,} motions rejected, marked below</text>'
         parts += [f'<path class="rejected" d="{marks}"/>', note]
     return parts
 

@@ -6,8 +6,13 @@ import math
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
+import numpy as np
+from numpy.typing import NDArray
+
 from fusion.result import Refinement
 from fusion.summary import loops_in_words
+
+Array = NDArray[np.float64]
 
 MODES = {"none": "no alignment", "origin": "first poses laid together", "yaw4": "yaw and translation",
          "se3": "SE(3): rotation and translation", "sim3": "Sim(3): rotation, translation and scale"}
@@ -119,9 +124,17 @@ def _times(before: float, after: float) -> str:
 
 
 def sentences(
-    refinement: Refinement, summary: Mapping[str, Any], within_3_sigma: float | None
+    refinement: Refinement, summary: Mapping[str, Any], within_3_sigma: float | None,
+    mean_biases: tuple[Array, Array] | None = None,
 ) -> list[tuple[str, str]]:
-    """(heading, sentence) pairs on what was concluded and why."""
+    """(heading, sentence) pairs on what was concluded and why.
+
+    Args:
+        refinement: the conclusions.
+        summary: as in `summary.json`.
+        within_3_sigma: share of positions inside their claim; None when unknown.
+        mean_biases: (3,) of gyro [rad/s] and accelerometer [m/s²]; None = those of the refinement's own frames.
+    """
     out = [("Estimator", f"{_begun(ESTIMATORS[refinement.estimator])}.")]
     if refinement.fallback_reason:
         much = "everywhere" if refinement.estimator == "graph" else "at all"
@@ -130,7 +143,8 @@ def sentences(
     out.append(("Scale", f"{_begun(POLICIES[scale.policy])}: one motion unit is "
                          f"{length(math.exp(scale.log_mean))} {spread(scale.log_sd)} (1 sd). "
                          f"Why: {_ended(scale.reason)}"))
-    out.append(("IMU", _imu(refinement)))
+    own = (refinement.gyro_bias_rad_s.mean(axis=0), refinement.accel_bias_m_s2.mean(axis=0))
+    out.append(("IMU", _imu(refinement, *(mean_biases or own))))
     out.append(("Camera and IMU", _camera_imu(refinement)))
     out.append(("Motions", _motions(refinement)))
     if (summary.get("loops") or {}).get("proposed"):
@@ -143,7 +157,7 @@ def sentences(
     return out
 
 
-def _imu(refinement: Refinement) -> str:
+def _imu(refinement: Refinement, gyro_bias_rad_s: Array, accel_bias_m_s2: Array) -> str:
     imu = refinement.imu
     if refinement.estimator == "motions":
         return "Not used, except to find out which way is up."
@@ -153,8 +167,8 @@ def _imu(refinement: Refinement) -> str:
                      "scale held (about 0.5 when all is well).")
     if imu.inflation != 1:
         parts.append(f"Their accelerometer noise was inflated {imu.inflation:g}-fold.")
-    biases = (f"{1e3 * math.hypot(*refinement.accel_bias_m_s2.mean(axis=0)):.0f} mm/s² and "
-              f"{angle(math.hypot(*refinement.gyro_bias_rad_s.mean(axis=0)))} per second")
+    biases = (f"{1e3 * math.hypot(*accel_bias_m_s2):.0f} mm/s² and "
+              f"{angle(math.hypot(*gyro_bias_rad_s))} per second")
     parts.append(f"Mean biases of accelerometer and gyro: {biases}.")
     if imu.gaps:
         parts.append(f"{_count(len(imu.gaps), 'hole')} of more than 0.5 s, where only the motions hold the frames.")

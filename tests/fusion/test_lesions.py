@@ -1,5 +1,6 @@
 """Lesions on a trajectory: where they are, how sure that is, and what is not known."""
 
+import json
 import shutil
 from dataclasses import replace
 from pathlib import Path
@@ -12,10 +13,11 @@ from benchmarks.simulated_lesions import SimulatedLesion
 from fusion import Provenance, Sighting, locate, write_lesions, write_run
 from fusion.config import RefineConfig
 from fusion.lesions.fixes import PIXEL_SD, DepthSource, place_sighting, pose_and_scale_covariance
+from fusion.lesions.merging import merge
 from fusion.lesions.table import COLUMNS
 from vio import se3
 from vio.depth_folder import read_depth_folder
-from vio.errors import CalibrationError
+from vio.errors import CalibrationError, FormatError
 
 SD = 0.10
 
@@ -82,6 +84,41 @@ def test_sd_maps_beside_predicted_depth_are_believed(case, tmp_path):
     (folder / "sensor.yaml").write_text((folder / "sensor.yaml").read_text().replace("0.0001", "-1"))
     with pytest.raises(CalibrationError, match="log_depth_sd_unit is -1"):
         read_depth_folder(folder, case.recording)
+
+
+@pytest.mark.parametrize(("said", "sd"), [({"image_log_sd": 0.4, "common_log_sd": 0.5}, 0.4),
+                                          ({"common_log_sd": 0.5}, 0.5), ("never calibrated", 0.0)])
+def test_neighbouring_maps_are_off_by_one_scale_that_no_merging_averages(case, tmp_path, said, sd):
+    folder = tmp_path / "depth"
+    shutil.copytree(case.depth, folder)
+    (folder / "prediction.json").write_text(json.dumps({"depth_uncertainty": said}))
+    source = DepthSource(read_depth_folder(folder, case.recording), None, None)
+    t_s, R_bc = case.refined.trajectory.t_s, case.refined.view.T_body_camera
+    for group in (g for g in case.groups if len(g) > 2):
+        rows = [Sighting("x", "finding", seen.frame, None, seen.pixel, "x") for seen in group]
+        fixes = [place_sighting(case.refined, row, row.frame, case.refined.view, source) for row in rows]
+        eyes = [(case.refined.trajectory.T_world_body[f.index] @ R_bc)[:3, 3] for f in fixes]
+        for fix, eye in zip(fixes, eyes, strict=True):
+            np.testing.assert_allclose(fix.image_m, sd * (fix.point_m - eye), atol=1e-12)
+        (place,) = merge(fixes, t_s)
+        added = place.own_cov - place.pixel_cov
+        assert np.linalg.eigvalsh(added).min() > -1e-12
+        away = [np.linalg.norm(f.point_m - eye) for f, eye in zip(fixes, eyes, strict=True)]
+        assert 0.7 * (sd * min(away)) ** 2 <= np.trace(added) <= (sd * max(away)) ** 2
+        # A minute later the maps are off by another scale, and the mean of both is surer.
+        late = [replace(f, index=f.index + 180) for f in fixes if f.index + 180 < len(t_s)]
+        if len(late) == len(fixes):
+            (both,) = merge([*fixes, *late], t_s)
+            assert np.trace(both.own_cov) <= np.trace(place.own_cov)
+
+
+def test_a_prediction_that_says_nonsense_is_refused(case, tmp_path):
+    folder = tmp_path / "depth"
+    shutil.copytree(case.depth, folder)
+    for text, words in (("{", "not valid JSON"), ('{"depth_uncertainty": {"image_log_sd": "x"}}', "image's ln scale")):
+        (folder / "prediction.json").write_text(text)
+        with pytest.raises(FormatError, match=words):
+            read_depth_folder(folder, case.recording)
 
 
 def test_pose_and_scale_belong_together(case):

@@ -42,7 +42,7 @@ def pixels_with(weights: dict[str, float], seed: int, count: int = 20_000, dof: 
     sd = np.exp(-2 + sum(w * used[:, PIXEL_SIGNALS.index(name)] for name, w in weights.items()))
     draws = rng.standard_normal(count) if np.isinf(dof) else rng.standard_t(dof, count) / np.sqrt(dof / (dof - 2))
     common = rng.normal(0, 0.3, 200).repeat(count // 200)
-    return PixelErrors(sd * draws, common, signals, np.arange(count) * 6 // count), sd
+    return PixelErrors(sd * draws, common, 0.5 * common, signals, np.arange(count) * 6 // count), sd
 
 
 WEIGHTS = st.dictionaries(st.sampled_from(PIXEL_SIGNALS), st.sampled_from([-0.5, -0.25, 0.25, 0.5]), min_size=1,
@@ -61,6 +61,7 @@ def test_known_deviations_are_found_again(weights, seed):
     assert np.abs(np.log(found / sd))[inside].max() < 0.15
     assert model.interval_95 == pytest.approx(1.96, abs=0.06)
     assert model.common_log_sd == pytest.approx(0.3, rel=0.15)
+    assert model.image_log_sd == pytest.approx(0.5 * model.common_log_sd)
     fresh, sd_fresh = pixels_with(weights, seed + 1000)
     within = np.abs(fresh.error) <= model.interval_95 * model.of_rows(fresh.signals)
     assert within.mean() == pytest.approx(0.95, abs=0.01)
@@ -234,7 +235,8 @@ def test_a_card_is_extended_without_touching_the_weights(file, ball, tmp_path):
 
 @pytest.mark.parametrize("change", [
     {"interval_95": None}, {"interval_95": -1.0}, {"signals": ["colour"], "mean": [0.0], "sd": [1.0], "log_sd": [0, 1]},
-    {"mean": [1.0] * 9}, {"log_sd": [float("nan")]}, {"common_log_sd": 0.0}])
+    {"mean": [1.0] * 9}, {"log_sd": [float("nan")]}, {"common_log_sd": 0.0},
+    {"image_log_sd": -0.1}])
 def test_broken_cards_are_refused_in_one_line(change):
     pixels, _ = pixels_with({"depth": 0.5}, 3)
     values = fit_depth_uncertainty(pixels, ["depth"]).to_dict()
