@@ -215,7 +215,8 @@ def main() -> None:
         "## Motion\n\nRotation: mean angle; direction: where the camera moves more than 0.5 mm; step after one scale "
         "per recording. \"Constant velocity\" is shown the TRUE step before.\n\n"
         + table(MOTION_HEADER, motion_rows(evaluation))
-        + f"\n\nThe gyro alone, its bias of 0.5°/s (sd) left in: {evaluation.gyro_alone_deg:.2f}° per step.",
+        + f"\n\nThe gyro alone, its bias of 0.5°/s (sd) left in: {evaluation.gyro_alone_deg:.2f}° per step; freed of "
+        f"the bias that gravity and the network's rotations tell: {evaluation.gyro_unbiased_deg:.3f}°.",
         "## By camera\n\n" + table(["camera", "AbsRel, image", "best guess", "rotation", "direction", "NEES"],
                                    by_camera(measured, cameras, maps, weights)),
         "## Covariances\n\nNEES is at each recording's own true scale; the scale prior answers for the rest.\n\n"

@@ -34,6 +34,8 @@ PRIOR_SD = np.array([0.5, 0.5, 0.5, 0.1])
 CAUCHY = 3.0
 MEDIAN_CHI2_3 = 2.366
 SEARCHED_S, SEARCH_STEP_S = 3.0, 0.02
+AROUND_S = 10.0
+"""Samples that are looked at before and after the compared motions: more than any offset that can be found."""
 CLEAR_CORRELATION, BETTER_CORRELATION = 0.6, 0.1
 """That another offset must reach, and by which it must beat the calibrated one, before the fit starts from it."""
 SIGNIFICANT = 4.0
@@ -167,6 +169,7 @@ def measure_camera_imu(problem: Problem, pairs: Pairs) -> CameraImu:
     """Rotation and time offset between camera and IMU from the gyro; `UNKNOWN` where too few motions compare."""
     if len(pairs) < LEAST_PAIRS:
         return UNKNOWN
+    problem = _around(problem, pairs)
     R_bc = problem.motions.T_body_camera[:3, :3]
     start, delta, bias = _search_offset(problem, pairs), np.zeros(3), problem.gyro_bias_rad_s
     tau, prior = start, np.diag(np.concatenate([PRIOR_SD, np.full(3, np.inf)]) ** -2)
@@ -183,6 +186,15 @@ def measure_camera_imu(problem: Problem, pairs: Pairs) -> CameraImu:
     sd = np.sqrt(np.maximum(variance, 1e-16))
     return CameraImu(len(pairs), delta, sd[:3], tau, float(sd[3]), float(np.sqrt(spread2)), False,
                      "within its uncertainty of the calibration")
+
+
+def _around(problem: Problem, pairs: Pairs) -> Problem:
+    """The problem with the inertial samples near the pairs alone: a whole examination has a million."""
+    ends = problem.t_s[pairs.node[[0, -1]] + [0, 1]] + [-AROUND_S, AROUND_S]
+    near = slice(*np.searchsorted(problem.imu_t_s, ends))
+    samples = problem.samples
+    cut = type(samples)(samples.t_ns[near], samples.gyro_rad_s[near], samples.accel_m_s2[near])
+    return replace(problem, samples=cut, imu_t_s=problem.imu_t_s[near])
 
 
 def check_clock(problem: Problem) -> None:

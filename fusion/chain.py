@@ -23,6 +23,7 @@ from numpy.lib.stride_tricks import as_strided
 from numpy.typing import NDArray
 from scipy.linalg.lapack import dpbtrf, dpbtrs
 
+from fusion.chain_far import Conditioned, FarFactors
 from fusion.joint import SAMPLES, JointSamples, checkpoints, square_root
 from vio.errors import EstimationError
 
@@ -56,12 +57,14 @@ class ChainSystem:
         self._window = as_strided(self.band, (self.blocks, self.reach, DIM, 2 * self.reach, DIM),
                                   tuple(size * s for s in (self.side * width, DIM * (width - 1), width - 1, DIM, 1)))
         self.gradient = np.zeros((self.blocks * self.reach, DIM))
+        self.far: FarFactors | None = None
         self._fill_up()
 
     def clear(self) -> None:
         """Forget all factors; the memory stays."""
         self.band.fill(0.0)
         self.gradient.fill(0.0)
+        self.far = None
         self._fill_up()
 
     def _fill_up(self) -> None:
@@ -139,11 +142,18 @@ class ChainFactor:
     """(blocks · side, width) lower band of L, by columns."""
 
     def solve(self) -> Array:
-        """The (M, 16) solution of the normal equations."""
-        x, info = dpbtrs(self.band.T, self.system.gradient.reshape(-1, 1), lower=1)
+        """The (M, 16) solution of the normal equations, far factors included."""
+        x = self._solved(self.system.gradient.reshape(-1, 1))
+        if self.system.far is not None:
+            x = Conditioned(self.system.far, self._solved, len(x)).solution(x)
+        return x.reshape(-1, DIM)[:self.system.nodes]
+
+    def _solved(self, right: Array) -> Array:
+        """H⁻¹ of columns (n, c), by the band alone."""
+        x, info = dpbtrs(self.band.T, right, lower=1)
         if info != 0 or not np.isfinite(x).all():
             raise EstimationError("graph: the linear system has no finite solution")
-        return np.asarray(x).reshape(-1, DIM)[:self.system.nodes]
+        return np.asarray(x)
 
     def backward(self) -> tuple[Array, Array]:
         """C^½ (K, side, side), upper triangular, and -Gᵀ (K, side, side) of all blocks."""
@@ -165,7 +175,8 @@ class ChainFactor:
         """Marginal covariances (M, 16, 16) of all frames, and joint samples of poses and log scales."""
         root, carry = self.backward()
         reach, side, K = self.system.reach, self.system.side, self.system.blocks
-        node = checkpoints(self.system.nodes)
+        kept, far = checkpoints(self.system.nodes), self.system.far
+        node = kept if far is None else np.unique(np.concatenate([kept, far.i, far.j]))
         stop = np.unique(node // reach)
         if stop[-1] != K - 1:
             raise EstimationError("graph: the last frame is not in the last block")
@@ -181,10 +192,14 @@ class ChainFactor:
             drawn[k] = A[k] @ drawn[k + 1] + noise[k] @ rng.standard_normal((side, SAMPLES))
         _fill(cov, root, carry, stop)
         at = np.searchsorted(stop, node // reach)
-        values = drawn.reshape(len(stop), reach, DIM, SAMPLES)[at, node % reach]
-        samples = JointSamples(node, np.ascontiguousarray(np.moveaxis(values[:, POSE], 2, 0)),
+        values, own = drawn.reshape(len(stop), reach, DIM, SAMPLES)[at, node % reach], self._own(cov)
+        if far is not None:
+            conditioned = Conditioned(far, self._solved, len(self.band))
+            own, values = conditioned.marginals_and_samples(own, node, values, rng)
+            values = values[np.searchsorted(node, kept)]
+        samples = JointSamples(kept, np.ascontiguousarray(np.moveaxis(values[:, POSE], 2, 0)),
                                np.ascontiguousarray(values[:, 0].T))
-        return self._own(cov), samples
+        return own, samples
 
     def _own(self, cov: Array) -> Array:
         """The frames' own blocks (M, 16, 16) of block covariances."""

@@ -1,23 +1,24 @@
-"""The engine of recordings whose motions join frames close in time: one band in the order of time."""
+"""The engine of recordings whose motions join frames close in time: one band in the order of time, and a few loops."""
 
 from __future__ import annotations
 
 from dataclasses import replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from fusion.chain import POSE
-from fusion.chain_model import ChainModel, ScaleWalk
+from fusion.chain_model import LONGEST_REACH, ChainModel, ScaleWalk
 from fusion.chain_solve import chain_gauss_newton
 from fusion.chain_start import chain_start, inertial_steps
 from fusion.config import RefineConfig
 from fusion.engine import Begin, Step, Uncertainty
 from fusion.problem import Problem
 from fusion.scale import Segments
+from fusion.scaled_motion import Linearized
 from fusion.solve import MotionTerm, Solution
 
-LONGEST_REACH = 4
-"""Frames that a motion may span; the work per frame grows with its square."""
+Array = NDArray[np.float64]
 
 
 class ChainEngine:
@@ -59,8 +60,15 @@ class ChainEngine:
             variance = cov[begins, 0, 0]
         return Uncertainty(np.ascontiguousarray(cov[:, POSE, POSE]), variance, joint)
 
-    def step(self, begin: Begin, term: MotionTerm) -> Step:
-        """One step, not taken."""
-        x = begin.model.linearize(begin.values, term).factor().solve()
+    def response(self, begin: Begin, term: MotionTerm, blocks: Linearized, error: Array) -> Step:
+        """How the solution moves when the motions' whitened measurements do; one factorisation."""
+        system = begin.model.linearize(begin.values, term)
+        weighted = (error * term.losses(blocks.squared_norm)[1][:, None])[:, :, None]
+        system.gradient.fill(0.0)
+        for node, A in ((term.motions.i, blocks.A_i), (term.motions.j, blocks.A_j)):
+            np.add.at(system.gradient[:, POSE], node, (np.swapaxes(A, 1, 2) @ weighted)[:, :, 0])
+        if term.segment is not None:
+            np.add.at(system.gradient[:, 0], term.motions.i, (np.swapaxes(blocks.A_s, 1, 2) @ weighted)[:, 0, 0])
+        x = system.factor().solve()
         scale = np.zeros(len(term.motions)) if term.segment is None else x[term.motions.i, 0]
         return Step(np.ascontiguousarray(x[:, POSE]), scale)

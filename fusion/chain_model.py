@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusion.chain import BIAS, BLOCK_NODES, DIM, POSE, SCALE, SCALE_AND_POSE, VELOCITY, ChainSystem, Nodes, spans
+from fusion.chain_far import JOINED, FarFactors
 from fusion.chain_state import ChainState
 from fusion.graph import Anchor
 from fusion.inertial import InertialSteps
@@ -29,6 +30,8 @@ Array = NDArray[np.float64]
 Indices = NDArray[np.int64]
 
 GRAVITY_WORLD = np.array([0.0, 0.0, -GRAVITY_M_S2])
+LONGEST_REACH = 4
+"""Frames that a motion of the band may span; the work per frame grows with its square."""
 TIE_INFORMATION = 1e10
 """Ties the copies of one log scale to 1e-5, far closer than any is known."""
 FIRST, SECOND = slice(1, 16), slice(1, 10)
@@ -77,7 +80,9 @@ class ChainModel:
 
     def linearize(self, state: ChainState, term: MotionTerm, memory: ChainSystem | None = None) -> ChainSystem:
         """Normal equations of all factors and the motions at `state`, in the memory of an earlier one if given."""
-        reach = int((term.motions.j - term.motions.i).max(initial=1))
+        span = term.motions.j - term.motions.i
+        far = np.flatnonzero(span > LONGEST_REACH)
+        reach = int(span.max(initial=1, where=span <= LONGEST_REACH))
         system = memory or ChainSystem(self.nodes, reach)
         if memory is not None:
             memory.clear()
@@ -88,7 +93,10 @@ class ChainModel:
         system.add_links(BIAS, self.steps.bias_walk_sd**-2, -np.diff(bias, axis=0))
         self._add_anchor(system, state)
         self._add_scale(system, state)
-        add_motions(system, state, term)
+        near = None if len(far) == 0 else np.flatnonzero(span <= LONGEST_REACH)
+        add_motions(system, state, term, near)
+        if len(far):
+            system.far = far_factors(state, term, far)
         return system
 
     def _residuals(self, state: ChainState, first: int, last: int) -> tuple[Array, Array, Array, Array, Array]:
@@ -163,10 +171,12 @@ class ChainModel:
         system.add_links(SCALE, information, wanted)
 
 
-def add_motions(system: ChainSystem, state: ChainState, term: MotionTerm) -> None:
-    """Add the relative motions with the weights of their loss."""
+def add_motions(system: ChainSystem, state: ChainState, term: MotionTerm, near: Indices | None = None) -> None:
+    """Add the relative motions, all or the `near` ones, with the weights of their loss."""
     motions, log_scale = term.motions, term.log_scale(state)
-    for group in _groups(motions.i, motions.j):
+    groups = _groups(motions.i, motions.j) if near is None else \
+        [near[group] for group in _groups(motions.i[near], motions.j[near])]
+    for group in groups:
         for first, last in spans(len(group), BLOCK_NODES):
             n = group[first:last]
             which = slice(int(n[0]), int(n[-1]) + 1) if n[-1] - n[0] == len(n) - 1 else n
@@ -177,6 +187,18 @@ def add_motions(system: ChainSystem, state: ChainState, term: MotionTerm) -> Non
                 A_i, rows = np.concatenate([blocks.A_s, A_i], axis=2), SCALE_AND_POSE
             i, j = _ends(motions.i[which], motions.j[which], system.reach)
             system.add(i, j, (rows, A_i * root[:, :, None]), (POSE, blocks.A_j * root[:, :, None]), blocks.b * root)
+
+
+def far_factors(state: ChainState, term: MotionTerm, far: Indices) -> FarFactors:
+    """The motions `far` with the weights of their loss, as factors outside the band."""
+    blocks = term.blocks(state, far, term.log_scale(state))
+    root = np.sqrt(term.losses(blocks.squared_norm, far)[1])[:, None]
+    A_i, A_j = (np.zeros((len(far), 6, JOINED)) for _ in range(2))
+    A_i[:, :, 1:], A_j[:, :, 1:] = blocks.A_i, blocks.A_j
+    if term.segment is not None:
+        A_i[:, :, :1] = blocks.A_s
+    return FarFactors(term.motions.i[far], term.motions.j[far], A_i * root[:, :, None], A_j * root[:, :, None],
+                      blocks.b * root)
 
 
 def _ends(i: Indices, j: Indices, reach: int) -> tuple[Nodes, Nodes]:

@@ -30,10 +30,12 @@ from fusion.joint import JointSamples
 from fusion.preintegration import make_bias
 from fusion.problem import Problem
 from fusion.scale import Segments
+from fusion.scaled_motion import Linearized
 from fusion.solve import MotionTerm, Solution
 from fusion.stretches import Stretch
 from vio.atomic import atomic_write
 from vio.errors import OutputError, VioError
+from vio.loops import Loops
 from vio.motions import UNREADABLE, RelativeMotions
 from vio.recording import Recording
 
@@ -43,15 +45,21 @@ KEY = "key.json"
 STATE = ("R", "p", "v", "accel_bias", "gyro_bias", "log_scale")
 
 
-def refinement_key(recording: Recording, motions: RelativeMotions, config: RefineConfig) -> str:
+def refinement_key(recording: Recording, motions: RelativeMotions, config: RefineConfig,
+                   loops: Loops | None = None) -> str:
     """SHA-256 of everything that a refinement depends on."""
     calibration = recording.calibration
-    arrays = (recording.frame_t_s, recording.imu.t_ns, recording.imu.gyro_rad_s, recording.imu.accel_m_s2,
-              calibration.T_body_camera, motions.t_i_s, motions.t_j_s, motions.T_i_j, motions.cov)
+    arrays: tuple[NDArray[Any], ...] = (
+        recording.frame_t_s, recording.imu.t_ns, recording.imu.gyro_rad_s, recording.imu.accel_m_s2,
+        calibration.T_body_camera, motions.t_i_s, motions.t_j_s, motions.T_i_j, motions.cov)
     facts = {"config": config.to_dict(), "imu_noise": asdict(calibration.imu_noise), "name": recording.name,
              "time_offset_s": calibration.time_offset_s, "scale": [motions.scale_log_mean, motions.scale_log_sd],
              "motions_meta": motions.meta,
              "libraries": {name: _version(name) for name in ("capsule-vio", "numpy", "scipy", "gtsam")}}
+    if loops is not None and loops.motions is not None:
+        m = loops.motions
+        facts["loops"] = [m.scale_log_mean, m.scale_log_sd]
+        arrays += (m.t_i_s, m.t_j_s, m.T_i_j, m.cov)
     return digest([json.dumps(facts, sort_keys=True).encode(), *(np.ascontiguousarray(a).tobytes() for a in arrays)])
 
 
@@ -171,9 +179,10 @@ class ResumableEngine:
                                     "xi": found.joint.xi, "log_scale": found.joint.log_scale})
         return found
 
-    def step(self, begin: Begin, term: MotionTerm) -> Step:
-        """As `ChainEngine.step`; quicker to compute again than to store."""
-        return self.engine.step(begin, term)
+    def response(self, begin: Begin, term: MotionTerm, blocks: Linearized,
+                 error: NDArray[np.float64]) -> Step:
+        """As `ChainEngine.response`; quicker to compute again than to store."""
+        return self.engine.response(begin, term, blocks, error)
 
     def _next(self, kind: str) -> str:
         self._calls += 1

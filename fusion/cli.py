@@ -21,6 +21,7 @@ from fusion.cli_progress import Progress
 from vio.errors import UsageError, VioError
 
 if TYPE_CHECKING:
+    from vio.loops import Loops
     from vio.motions import RelativeMotions
     from vio.recording import Recording
 
@@ -179,13 +180,18 @@ def _refine(arguments: argparse.Namespace) -> int:
               "frames": arguments.recording / "mav0" / "cam0" / "data.csv"}
     inputs |= {"motions" if k == 0 else f"motions_{k + 1}": path for k, path in enumerate(arguments.motions or ())}
     inputs = {name: path for name, path in inputs.items() if path.is_file()}
+    if arguments.loops_from is not None:
+        inputs["loops"] = arguments.loops_from
+    if arguments.online and (arguments.loops or arguments.loops_from):
+        raise UsageError("loops are closed when a recording is whole: --online goes without --loops and --loops-from")
     with unfinished(arguments.out) as kept:
         motions = _motions(arguments, recording, inputs, kept)
+        loops = _loops(arguments, recording, motions, kept)
         with Progress(remaining_s) as progress:
             if arguments.online:
                 refined = online_refine(recording, motions, config, arguments.lag, progress.count)
             else:
-                refined = refine(recording, motions, config, progress, kept / "graph")
+                refined = refine(recording, motions, config, progress, kept / "graph", loops)
             # What people call their files may be a patient's name: a run is named after the folder it is written to.
             refined = replace(refined, name=arguments.out.resolve().name)
             progress("run_folder")
@@ -221,6 +227,28 @@ def _motions(arguments: argparse.Namespace, recording: Recording, inputs: dict[s
             learned.predict(recording, arguments.weights, unfinished=kept / "pairs",
                             progress=progress.count).save(stored)
     return load_motions(stored)
+
+
+def _loops(arguments: argparse.Namespace, recording: Recording, motions: RelativeMotions, kept: Path) -> Loops | None:
+    """The loops that were given, or found in the images and kept until the run is written."""
+    from fusion.checkpoint import Checkpoint, refinement_key
+    from fusion.config import RefineConfig
+    from fusion.run_folder import sha256_of
+    from vio.loops import load_loops
+
+    if arguments.loops_from is not None:
+        return load_loops(arguments.loops_from)
+    if not arguments.loops:
+        return None
+    from learned.loops import find_loops
+
+    weights = "bundled" if arguments.weights is None else sha256_of(arguments.weights)
+    key = f"{weights} {refinement_key(recording, motions, RefineConfig())}"
+    stored = Checkpoint(kept / "loops", key).folder / "loops.npz"
+    if not stored.is_file():
+        with Progress() as progress:
+            find_loops(recording, motions, arguments.weights, progress=progress.count).save(stored)
+    return load_loops(stored)
 
 
 def _compare(arguments: argparse.Namespace) -> int:

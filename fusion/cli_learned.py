@@ -16,6 +16,7 @@ if TYPE_CHECKING:
 
 def train(arguments: argparse.Namespace) -> int:
     """Train, and calibrate what was trained."""
+    from learned.distributed import leads
     from learned.train_command import run_training
     from vio.formats import open_recording
 
@@ -23,7 +24,8 @@ def train(arguments: argparse.Namespace) -> int:
                           for paths in (arguments.recordings, arguments.calibrate))
     with Progress() as progress:
         trained = run_training(recordings, others, vars(arguments), progress.count)
-    print(trained)
+    if leads():
+        print(trained)
     return 0
 
 
@@ -47,6 +49,7 @@ def predict(arguments: argparse.Namespace) -> int:
     from vio.formats import open_recording
 
     recording = open_recording(arguments.recording)
+    motions: RelativeMotions
     if arguments.method == "classical":
         from vio.odometry import measure_recording
 
@@ -64,6 +67,13 @@ def predict(arguments: argparse.Namespace) -> int:
     lost = motions.meta.get("unreadable_frames", {})
     print(f"{arguments.out}: {len(motions)} motions"
           + (f"; without frame {', '.join(lost)}: {next(iter(lost.values()))}" if lost else ""))
+    if arguments.loops is not None:
+        from learned.loops import find_loops
+
+        with Progress() as progress:
+            loops = find_loops(recording, motions, arguments.weights, progress=progress.count)
+        loops.save(arguments.loops)
+        print(f"{arguments.loops}: {len(loops)} loops of {loops.proposed} pairs of frames that look alike")
     return 0
 
 
@@ -80,10 +90,13 @@ def _depth_aligned(recording: Recording, arguments: argparse.Namespace) -> Relat
 def benchmark(arguments: argparse.Namespace) -> int:
     """Measure one of the paper's tables."""
     from learned.benchmark.command import run_table, summary
+    from learned.distributed import leads
 
     with Progress() as progress:
         result = run_table(arguments.table, arguments.data, arguments.budget, arguments.out, seeds=arguments.seeds,
                            method=arguments.method, device=arguments.device, progress=progress)
+    if not leads():
+        return 0
     if arguments.json:
         print_json(result)
     else:

@@ -11,7 +11,7 @@ ORGANS = ("colon", "small-bowel", "stomach")
 FORMATS = ("asl", "endoslam", "vrcaps", "simcol3d", "scared", "tum-rgbd", "jhu-sinus", "kitti", "c3vd", "video",
            "images")
 VIBRATIONS = ("none", "gaussian", "peristalsis", "collision")
-DRIVING = ("natural", "operated", "brisk", "transit")
+DRIVING = ("natural", "operated", "brisk", "one-way", "withdrawn", "transit")
 CAMERAS = ("mirocam", "fisheye-140", "fisheye-156", "pinhole-110")
 PRODUCTS = ("normals", "albedo", "mask", "flow")
 DATASETS = ("mm-wce",)
@@ -74,7 +74,8 @@ def _simulate(commands: Commands) -> None:
     parser.add_argument("--duration", type=float, default=60.0, metavar="S", help="seconds, of each recording")
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--driving", choices=DRIVING, default="natural",
-                        help="transit: as slow as in life; natural: ten times that; operated, brisk: driven through")
+                        help="transit: as slow as in life; natural: ten times that; operated, brisk: driven through; "
+                             "one-way: never back; withdrawn: half the time there, then back")
     parser.add_argument("--start", type=float, metavar="SHARE", help="place in the organ to start at, 0 to 1")
     parser.add_argument("--camera", choices=CAMERAS, default="mirocam")
     parser.add_argument("--size", type=int, default=320, metavar="PIXELS", help="width and height of the images")
@@ -160,6 +161,8 @@ def _predict(commands: Commands) -> None:
     parser.add_argument("--rotation", choices=("network", "gyro"), default="network",
                         help="gyro: correct the rotation by the gyro; for use without `refine`, which does so itself")
     parser.add_argument("--depth", type=Path, metavar="DIR", help="also write the predicted depth maps and their sd")
+    parser.add_argument("--loops", type=Path, metavar="loops.npz",
+                        help="also look for places that are seen again, for `refine --loops-from`")
     parser.add_argument("--out", type=Path, required=True, metavar="motions.npz")
 
 
@@ -177,6 +180,10 @@ def _refine(commands: Commands) -> None:
     parser.add_argument("--lag", type=float, default=30.0, metavar="S",
                         help="how long a frame stays open to correction online (default: 30 s)")
     parser.add_argument("--config", type=Path, metavar="c.yaml")
+    again = parser.add_mutually_exclusive_group()
+    again.add_argument("--loops", action="store_true",
+                       help="look for places that are seen again, in the images, and close the loops")
+    again.add_argument("--loops-from", type=Path, metavar="loops.npz", help="close loops that predict --loops found")
     parser.add_argument("--out", type=Path, required=True, metavar="RUN")
     _json(parser)
 

@@ -28,8 +28,8 @@ class ScaleConfig:
 
     policy: Literal["auto", "free", "prior", "fixed"] = "auto"
     """"auto" decides from the data; the others force it."""
-    segment_s: float = 33.0
-    """Length of the stretches that share one scale variable [s]."""
+    segment_s: float = 1.0
+    """Length of the stretches that share one scale variable [s]; the walk, not this, says how fast scale may change."""
     walk_per_sqrt_s: float = 0.0055
     """Random walk of the log scale [1/sqrt(s)]; 0.10 per 1000 frames at 3 Hz."""
     imu_chi2_limit: float = 1.5

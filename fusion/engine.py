@@ -12,6 +12,7 @@ from fusion.config import RefineConfig
 from fusion.joint import JointSamples
 from fusion.problem import Problem
 from fusion.scale import Segments
+from fusion.scaled_motion import Linearized
 from fusion.solve import MotionTerm, Solution
 from fusion.stretches import Stretch
 
@@ -44,7 +45,7 @@ class Uncertainty:
 
 @dataclass(frozen=True)
 class Step:
-    """A Gauss-Newton step."""
+    """A linear change of a solution."""
 
     pose: Array
     """(M, 6) of the poses, body axes, rotation first."""
@@ -73,6 +74,9 @@ class Engine(Protocol):
         """Covariances at `begin.values`; segments are None where scale is held."""
         ...
 
-    def step(self, begin: Begin, term: MotionTerm) -> Step:
-        """One step from `begin.values`, not taken."""
+    def response(self, begin: Begin, term: MotionTerm, blocks: Linearized, error: Array) -> Step:
+        """How the solution `begin.values` moves when the motions' whitened measurements move by `error` (N, 6).
+
+        `blocks` is the term linearised there.
+        """
         ...

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from fusion.joint import SEED, JointSamples, chain_samples, stretch_directions, with_assumed_scale
 from fusion.problem import Problem
-from fusion.result import ScaleConclusion
+from fusion.result import LoopConclusion, ScaleConclusion
 from vio import se3
 from vio.motions import RelativeMotions, chain_motions
 
@@ -43,6 +43,8 @@ class Estimate:
     """How the errors of all poses hang together; None where it could not be sampled."""
     notes: tuple[str, ...] = ()
     """Where less than the whole of the estimator was used, and why."""
+    loops: LoopConclusion | None = None
+    """What became of the loops; None where none was asked for, or the estimator takes none."""
     translation_noise: float = 1.0
     """Factor by which the problem's noise of the translations was corrected; 1 where it was kept."""
 

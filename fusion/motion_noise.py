@@ -13,7 +13,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from fusion.engine import Begin, Engine
+from fusion.engine import Begin, Engine, Step
 from fusion.graph import read_poses
 from fusion.scaled_motion import Linearized, ScaledMotions, linearize
 from fusion.solve import MotionTerm
@@ -43,7 +43,7 @@ def measured_once(motions: ScaledMotions) -> bool:
     Sources that share errors are closer to each other than to the truth, and carry covariances widened for it: their
     residuals would make the noise look smaller than it is.
     """
-    pairs = np.unique(np.column_stack([motions.i, motions.j]), axis=0)
+    pairs = np.unique(motions.i * (int(motions.j.max()) + 1) + motions.j)
     return len(pairs) > ONCE * len(motions)
 
 
@@ -72,29 +72,21 @@ def translation_noise(engine: Engine, begin: Begin, term: MotionTerm, rng: np.ra
     accepted = term.weight == 1.0
     if accepted.sum() < LEAST_MOTIONS or not measured_once(term.motions):
         return 1.0
-    still = engine.step(begin, term)
     blocks = linearize(term.motions, *read_poses(begin.values), term.log_scale(begin.values))
     residual2 = float((blocks.b[accepted, 3:] ** 2).sum())
     probes = max(1, round(PROBED_MOTIONS / len(term.motions)))
     followed = 0.0
     for _ in range(probes):
-        z = rng.standard_normal((len(term.motions), 3)) * accepted[:, None]
-        moved = engine.step(begin, _shifted(term, z))
-        response = _response(blocks, term.motions, moved.pose - still.pose, moved.scale - still.scale)
-        followed += float((z * response)[accepted].sum()) / probes
+        z = np.zeros((len(term.motions), 6))
+        z[:, 3:] = rng.standard_normal((len(z), 3)) * accepted[:, None]
+        moved = engine.response(begin, term, blocks, z)
+        followed += float((z[:, 3:] * _predicted(blocks, term.motions, moved))[accepted].sum()) / probes
     redundancy = 3 * int(accepted.sum()) - followed
     return bounded(np.sqrt(residual2 / redundancy)) if redundancy > LEAST_REDUNDANCY else 1.0
 
 
-def _shifted(term: MotionTerm, z: Array) -> MotionTerm:
-    """The term whose measured translations are larger by whitened amounts z (N, 3); Jacobians stay as they are."""
-    motions = term.motions
-    error = np.linalg.solve(motions.whiten[:, 3:, 3:], z[:, :, None])
-    return replace(term, motions=replace(motions, t=motions.t + (motions.R @ error)[:, :, 0]))
-
-
-def _response(blocks: Linearized, motions: ScaledMotions, pose: Array, scale: Array) -> Array:
-    """(N, 3) change of the predicted whitened translations under changes (M, 6) of poses and (N,) of log scales."""
+def _predicted(blocks: Linearized, motions: ScaledMotions, change: Step) -> Array:
+    """(N, 3) change of the predicted whitened translations under a change of the solution."""
     A_i, A_j, A_s = (A[:, 3:] for A in (blocks.A_i, blocks.A_j, blocks.A_s))
-    change = (A_i @ pose[motions.i][:, :, None] + A_j @ pose[motions.j][:, :, None])[:, :, 0]
-    return np.asarray(change + A_s[:, :, 0] * scale[:, None])
+    moved = (A_i @ change.pose[motions.i][:, :, None] + A_j @ change.pose[motions.j][:, :, None])[:, :, 0]
+    return np.asarray(moved + A_s[:, :, 0] * change.scale[:, None])

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import gtsam
 import numpy as np
 from gtsam.symbol_shorthand import S, X
+from numpy.typing import NDArray
 
 from fusion.config import RefineConfig
 from fusion.covariance import marginal_covariances
@@ -14,7 +17,10 @@ from fusion.initialization import chunked_start
 from fusion.joint_graph import sample_graph
 from fusion.problem import Problem
 from fusion.scale import Segments
+from fusion.scaled_motion import Linearized
 from fusion.solve import MotionTerm, Solution, gauss_newton, linear_graph, linear_step
+
+Array = NDArray[np.float64]
 
 
 class NativeEngine:
@@ -50,9 +56,14 @@ class NativeEngine:
         joint = sample_graph(gaussian, nodes, None if segments is None else segments.of_node, rng)
         return Uncertainty(cov, variance, joint)
 
-    def step(self, begin: Begin, term: MotionTerm) -> Step:
-        """One step, not taken."""
-        gaussian = linear_graph(begin.model, begin.values, term)
+    def response(self, begin: Begin, term: MotionTerm, blocks: Linearized, error: Array) -> Step:
+        """How the solution moves when the motions' whitened measurements do: one step less another."""
+        still, moved = (self._step(begin, term, replace(blocks, b=b)) for b in (blocks.b, blocks.b + error))
+        return Step(moved.pose - still.pose, moved.scale - still.scale)
+
+    @staticmethod
+    def _step(begin: Begin, term: MotionTerm, blocks: Linearized) -> Step:
+        gaussian = linear_graph(begin.model, begin.values, term, blocks)
         delta = linear_step(gaussian, gtsam.Ordering.MetisGaussianFactorGraph(gaussian))
         pose = np.array([delta.at(X(k)) for k in range(int(term.motions.j.max()) + 1)])
         if term.segment is None:

@@ -87,7 +87,7 @@ def build_problem(recording: Recording, motions: RelativeMotions) -> Problem:
     gaps = tuple(find_gaps(imu_t))
     batch = make_motions(i - lo, j - lo, motions.T_i_j, motions.cov, recording.calibration.T_body_camera)
     usable = _usable(t, gaps)
-    gyro_bias = _initial_gyro_bias(split_at_frames(recording.imu, imu_t, t), batch, np.diff(t), usable)
+    gyro_bias = _initial_gyro_bias(recording, batch, t, usable)
     batch = _unchecked(batch, usable)
     usable &= ~_blind(batch, t)
     pieces = split_at_frames(recording.imu, imu_t, t, gyro_bias)
@@ -132,6 +132,8 @@ def _usable(t: Array, gaps: tuple[Gap, ...]) -> NDArray[np.bool_]:
 
 def _unchecked(motions: ScaledMotions, usable: NDArray[np.bool_]) -> ScaledMotions:
     """Where the IMU is missing nothing tells an outlier from motion: what is measured there counts less."""
+    if usable.all():
+        return motions
     missing = np.concatenate([[0], np.cumsum(~usable)])
     alone = missing[motions.j] > missing[motions.i]
     return replace(motions, whiten=motions.whiten / np.where(alone, UNCHECKED, 1.0)[:, None, None])
@@ -162,13 +164,14 @@ def _saturation_inflation(recording: Recording, t: Array) -> tuple[Array, Array]
     return factors[0], factors[1]
 
 
-def _initial_gyro_bias(pieces: ImuPieces, motions: ScaledMotions, dt: Array, usable: NDArray[np.bool_]) -> Array:
+def _initial_gyro_bias(recording: Recording, motions: ScaledMotions, t: Array, usable: NDArray[np.bool_]) -> Array:
     """Median of `Log(R_measᵀ R_gyro) / dt` over consecutive motions: robust, needs no graph."""
-    surest = motions.surest_neighbours(len(dt) + 1)
+    surest = motions.surest_neighbours(len(t))
     k = np.flatnonzero((surest >= 0) & usable)[:BIAS_FRAMES]
     if len(k) == 0:
         return np.zeros(3)
+    pieces = split_at_frames(recording.imu, recording.imu_t_s, t[:k[-1] + 2])
     gyro = preintegrate_rotation(pieces, np.zeros(3))[k]
     off = se3.so3_log(np.swapaxes(motions.select(surest[k]).body_rotation(), 1, 2) @ gyro)
-    bias: Array = np.median(off / dt[k, None], axis=0)
+    bias: Array = np.median(off / np.diff(t)[k, None], axis=0)
     return bias

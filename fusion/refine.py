@@ -17,14 +17,16 @@ from fusion.ekf import ekf_estimate
 from fusion.estimate import Estimate, motions_estimate
 from fusion.graph_estimator import GraphEstimator
 from fusion.initialization import level_rotation
+from fusion.loops import GraphLoops, check_loops, make_loops, none_held
 from fusion.prepare import prepare
 from fusion.problem import Problem
-from fusion.result import Estimator, ImuConclusion, Refinement, View
+from fusion.result import NO_LOOPS, Estimator, ImuConclusion, LoopConclusion, Refinement, View
 from fusion.stages import Stages
 from vio import se3
 from vio.errors import EstimationError
 from vio.imu import preintegrate_rotation
 from vio.inertial_levels import inertial_levels
+from vio.loops import Loops
 from vio.motions import RelativeMotions, chain_motions
 from vio.recording import Recording
 from vio.trajectory import Trajectory
@@ -33,7 +35,8 @@ Array = NDArray[np.float64]
 
 
 def refine(recording: Recording, motions: RelativeMotions, config: RefineConfig | None = None,
-           announce: Callable[[str], None] | None = None, resume: str | Path | None = None) -> Refinement:
+           announce: Callable[[str], None] | None = None, resume: str | Path | None = None,
+           loops: Loops | None = None) -> Refinement:
     """Turn relative motions and inertial samples into one globally consistent trajectory.
 
     Args:
@@ -43,6 +46,8 @@ def refine(recording: Recording, motions: RelativeMotions, config: RefineConfig 
         announce: called with the name of every stage as it begins.
         resume: folder that keeps finished stages of the graph. The same call after a kill reads them back and ends
             with the same bytes; whoever asked for the folder removes it in the end (`checkpoint.unfinished`).
+        loops: motions between frames that show the same place again, such as `learned.find_loops` finds; each is used
+            only where the graph finds nothing against it. None = none are looked for.
 
     Returns:
         The refined trajectory with covariances, beside the trajectory of the motions alone at the
@@ -56,18 +61,31 @@ def refine(recording: Recording, motions: RelativeMotions, config: RefineConfig 
     stages = Stages(announce)
     with stages("checks"):
         recording, problem, camera_imu = prepare(recording, motions)
-    checkpoint = None if resume is None else Checkpoint(resume, refinement_key(recording, motions, config))
-    estimate, estimator, reason = _first_that_works(problem, motions, config, stages, checkpoint)
+        of_graph = None if loops is None else _of_graph(recording, problem, loops)
+    checkpoint = None if resume is None else Checkpoint(resume, refinement_key(recording, motions, config, loops))
+    estimate, estimator, reason = _first_that_works(problem, motions, config, stages, checkpoint, of_graph)
     refined = conclude(recording, motions, problem, estimate, estimator, reason, stages)
-    return replace(refined, camera_imu=camera_imu)
+    return replace(refined, camera_imu=camera_imu, loops=_loop_conclusion(estimate, of_graph))
+
+
+def _of_graph(recording: Recording, problem: Problem, loops: Loops) -> GraphLoops:
+    check_loops(loops, recording.frame_t_s)
+    return make_loops(loops, recording.frame_t_s, problem.t_s, problem.motions.T_body_camera, problem.scale_log_mean)
+
+
+def _loop_conclusion(estimate: Estimate, loops: GraphLoops | None) -> LoopConclusion:
+    if estimate.loops is not None:
+        return estimate.loops
+    return NO_LOOPS if loops is None else none_held(loops.conclusion, "only the graph can use it")
 
 
 def _first_that_works(problem: Problem, motions: RelativeMotions, config: RefineConfig, stages: Stages,
-                      checkpoint: Checkpoint | None) -> tuple[Estimate, Estimator, str | None]:
+                      checkpoint: Checkpoint | None,
+                      loops: GraphLoops | None) -> tuple[Estimate, Estimator, str | None]:
     reasons: list[str] = []
     if config.estimator in ("auto", "graph"):
         try:
-            estimate = _sane(GraphEstimator(problem, config, stages, checkpoint).estimate(), "graph")
+            estimate = _sane(GraphEstimator(problem, config, stages, checkpoint, loops).estimate(), "graph")
             return estimate, "graph", "; ".join(estimate.notes) or None
         except EstimationError as error:
             if config.estimator == "graph":

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Literal
 
@@ -48,6 +49,25 @@ class ImuConclusion:
     """Factor on the accelerometer density that the scale policy asked for; 1 = as calibrated."""
     gaps: tuple[Gap, ...]
     """Holes over 0.5 s; their frame intervals carry no inertial factor."""
+
+
+@dataclass(frozen=True)
+class LoopConclusion:
+    """What became of the loops that were proposed."""
+
+    proposed: int = 0
+    """Pairs of frames that looked alike."""
+    refused: Mapping[str, int] = field(default_factory=dict)
+    """How many of them were not used, by reason."""
+    frames: NDArray[np.int64] = field(default_factory=lambda: np.zeros((0, 2), np.int64))
+    """(L, 2) nodes of the verified loops that the motions span."""
+    distance2: Array = field(default_factory=lambda: np.zeros(0))
+    """(L,) squared whitened distance from the final trajectory (6 degrees of freedom)."""
+    accepted: NDArray[np.bool_] = field(default_factory=lambda: np.zeros(0, bool))
+    """(L,) whether the trajectory was built with it."""
+
+
+NO_LOOPS = LoopConclusion()
 
 
 @dataclass(frozen=True)
@@ -124,6 +144,8 @@ class Refinement:
     """How the frames looked at the world; None when unknown."""
     inertial: InertialLevels | None = None
     """What the IMU felt along time; None when unknown."""
+    loops: LoopConclusion = NO_LOOPS
+    """What became of the loops that were proposed; nothing where none was looked for."""
     online: OnlineConclusion | None = None
     """Where the recording was estimated frame by frame; the trajectory then holds poses as they left the lag."""
 

@@ -72,6 +72,8 @@ def write_run(refinement: Refinement, out: str | Path, provenance: Provenance,
             write_tum(refinement.truth, folder / "truth.tum")
         if refinement.online is not None:
             write_tum(refinement.online.filtered, folder / "filtered.tum")
+        if refinement.loops.proposed:
+            (folder / "loops.csv").write_text(_loops_csv(refinement), encoding="utf-8")
         _write_states(refinement, folder / "trajectory.npz")
         _write_json(summary, folder / "summary.json")
         write_trajectory_plot(refinement, folder / "trajectory.svg", motions)
@@ -118,6 +120,16 @@ def _write_states(r: Refinement, path: Path) -> None:
         log_scale_sd=r.log_scale_sd, rejected=r.rejected, **joint_arrays(r.joint), **view_arrays(r.view),
         **inertial_arrays(r.inertial),
     )
+
+
+def _loops_csv(r: Refinement) -> str:
+    """The verified loops: numbers and times of both frames, distance² from the trajectory in sigmas, whether used."""
+    first, t = 0 if r.view is None else r.view.first_frame, r.trajectory.t_s
+    rows = ["frame_i,frame_j,t_i_s,t_j_s,distance2,accepted"]
+    for (i, j), distance2, accepted in zip(r.loops.frames.tolist(), r.loops.distance2, r.loops.accepted, strict=True):
+        far = f"{distance2:.3f}" if np.isfinite(distance2) else ""
+        rows.append(f"{first + i},{first + j},{t[i]:.6f},{t[j]:.6f},{far},{int(accepted)}")
+    return "\n".join(rows) + "\n"
 
 
 def _write_json(value: dict[str, Any], path: Path) -> None:

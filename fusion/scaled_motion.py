@@ -16,6 +16,7 @@ quadratic in the number of frames.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -52,12 +53,16 @@ class ScaledMotions:
 
     def surest_neighbours(self, nodes: int) -> NDArray[np.int64]:
         """(nodes-1,) the surest motion from every node to the next, -1 where none is: the choice of `chain_motions`."""
-        variance = np.square(np.linalg.inv(self.whiten)).sum(axis=(1, 2))  # trace of the covariance
-        order = np.argsort(-variance, kind="stable")
+        order = np.argsort(-self._variance, kind="stable")
         order = order[(self.j - self.i)[order] == 1]
         surest = np.full(nodes - 1, -1, np.int64)
         surest[self.i[order]] = order
         return surest
+
+    @cached_property
+    def _variance(self) -> Array:
+        """(N,) traces of the covariances."""
+        return np.asarray(np.square(np.linalg.inv(self.whiten)).sum(axis=(1, 2)))
 
     def body_rotation(self) -> Array:
         """(N, 3, 3) measured rotation of body j in body i."""

@@ -38,8 +38,8 @@ class MotionTerm:
     """(N,) scale segment of every motion; None when scale is held."""
     held_log_scale: float
     """Used where `segment` is None."""
-    huber: float | None
-    """Threshold of the Huber loss (logarithmic beyond `GROSS`); None for plain weights."""
+    huber: float | Array | None
+    """Threshold of the Huber loss (logarithmic beyond `GROSS`), of all or (N,) of each; None for plain weights."""
     weight: Array
     """(N,) fixed weights (the gate) on top of the loss."""
     first_node: int = 0
@@ -61,10 +61,11 @@ class MotionTerm:
         fixed = self.weight if which is None else self.weight[which]
         if self.huber is None:
             return float(0.5 * (fixed * squared_norm).sum()), fixed
-        k, norm = self.huber, np.maximum(np.sqrt(squared_norm), 1e-12)
+        k = self.huber if which is None or np.ndim(self.huber) == 0 else np.asarray(self.huber)[which]
+        norm = np.maximum(np.sqrt(squared_norm), 1e-12)
         straight = k * np.minimum(norm, GROSS) - 0.5 * k**2
         loss = np.where(norm <= k, 0.5 * squared_norm, straight + k * GROSS * np.log(np.maximum(norm / GROSS, 1.0)))
-        weight = np.minimum(1.0, k / norm) * np.minimum(1.0, GROSS / norm)
+        weight = np.where(norm <= k, 1.0, k / norm * np.minimum(1.0, GROSS / norm))
         return float((fixed * loss).sum()), fixed * weight
 
     def blocks(self, values: Values, which: Which, log_scale: Array) -> Linearized:
@@ -105,12 +106,11 @@ class Solution:
     iterations: int
 
 
-def linear_graph(native: gtsam.NonlinearFactorGraph, values: gtsam.Values,
-                 term: MotionTerm) -> gtsam.GaussianFactorGraph:
-    """All factors linearised at `values`."""
+def linear_graph(native: gtsam.NonlinearFactorGraph, values: gtsam.Values, term: MotionTerm,
+                 blocks: Linearized | None = None) -> gtsam.GaussianFactorGraph:
+    """All factors linearised at `values`, the motions as `blocks` has them if given."""
     gaussian = native.linearize(values)
-    blocks = linearize(term.motions, *read_poses(values), term.log_scale(values))
-    _push(gaussian, blocks, term)
+    _push(gaussian, blocks or linearize(term.motions, *read_poses(values), term.log_scale(values)), term)
     return gaussian
 
 

@@ -34,7 +34,8 @@ def summarize(refinement: Refinement) -> dict[str, Any]:
         "camera_imu": r.camera_imu.to_dict(),
         "motions": {"used": r.motions_used, "rejected": len(r.rejected), "bridged": r.bridged,
                     "rotation_noise": r.motion_noise[0], "translation_noise": r.motion_noise[1]},
-        "loops": {"proposed": 0, "accepted": 0},
+        "loops": {"proposed": r.loops.proposed, "accepted": int(r.loops.accepted.sum()),
+                  "refused": dict(sorted(r.loops.refused.items()))},
         "time_offset_s": r.time_offset_s,
         "timing_s": r.timing_s,
         "peak_rss_bytes": r.peak_rss_bytes,
@@ -73,6 +74,8 @@ def sentences(summary: dict[str, Any]) -> str:
         f"scale: {scale['policy']} – {scale['reason']}",
         f"motions: {summary['motions']['used']} used, {summary['motions']['rejected']} rejected",
     ]
+    if summary["loops"]["proposed"]:
+        lines.append(f"loops: {loops_in_words(summary['loops'])}")
     if "online" in summary:
         ms = summary["online"]["latency_ms"]
         lines.append(f"online with {summary['online']['lag_s']:g} s lag: latency per frame {ms['p50']:.1f} ms in the "
@@ -80,3 +83,10 @@ def sentences(summary: dict[str, Any]) -> str:
     if "accuracy" in summary:
         lines.append(verdict(summary["accuracy"]["motions"], summary["accuracy"]["refined"]))
     return "\n".join(lines)
+
+
+def loops_in_words(loops: dict[str, Any]) -> str:
+    """Which places were recognised, and why the other proposals were not believed."""
+    count, refused = loops["accepted"], sorted(loops["refused"].items(), key=lambda item: (-item[1], item[0]))
+    text = f"{count} of {loops['proposed']} pairs of frames that look alike were used as the same place seen again"
+    return text + (": " + "; ".join(f"{n} not, {reason}" for reason, n in refused) if refused else "") + "."

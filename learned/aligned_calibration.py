@@ -115,7 +115,7 @@ def align(m: Measured, tracks: Tracks, noise: DepthNoise) -> Aligned:
     k = fits.frame
     parts = {name: getattr(m, name)[k] for name in ("images", "depth", "T_i_j", "T_true_m", "signals", "step_s")}
     true = None if m.depth_true_m is None else m.depth_true_m[k]
-    return Aligned(replace(m, **parts, depth_true_m=true, R_gyro=None if m.R_gyro is None else m.R_gyro[k]), fits)
+    return Aligned(replace(m, **parts, depth_true_m=true, gyro=None), fits)
 
 
 def aligned_score(aligned: Sequence[Aligned]) -> Any:

@@ -17,7 +17,7 @@ from learned.aligned_calibration import aligned_section
 from learned.dataset import frames_of_split
 from learned.depth_calibration import depth_uncertainty_section
 from learned.errors import TrainingError, WeightsError
-from learned.evaluation import angle_deg, depth_score, motion_score, nees_of
+from learned.evaluation import depth_score, motion_score, nees_of
 from learned.inference import SIGNALS
 from learned.measured import Measured, measure
 from learned.scale_gain import scale_gain_sd
@@ -82,7 +82,7 @@ def measured_parts(method: Any, run: TrainedRun, trained_on: Sequence[Recording]
 
 
 def calibrated(measured: Sequence[Measured]) -> dict[str, Any]:
-    """Scale prior, uncertainty model, gyro deviation and figures from predictions beside truth.
+    """Scale prior, uncertainty model and figures from predictions beside truth.
 
     Raises:
         TrainingError: fewer than 60 pairs of recordings in which the camera moves.
@@ -99,15 +99,12 @@ def calibrated(measured: Sequence[Measured]) -> dict[str, Any]:
     chosen = choose_signals(errors, signals, SIGNALS, recording)
     model = fit_uncertainty(errors, signals, SIGNALS, chosen)
     spread = float(np.std(scales, ddof=1)) if len(scales) > 1 else 1.0
-    gyro = [np.radians(angle_deg(_transforms(m.R_gyro), m.T_true_m)) for m in used if m.R_gyro is not None]
     depth, motion = depth_score([m.depth for m in used], used), motion_score([m.T_i_j for m in used], used)
     return {
         **depth_sections(used, model, float(np.mean(scales))),
         "scale_log_mean": float(np.mean(scales)), "scale_log_sd": max(spread, LEAST_SCALE_SD),
         "uncertainty": model.to_dict(),
         "scale_gain_sd": scale_gain_sd(used),
-        # Root mean square per axis: noise, and the bias that nobody has removed.
-        "gyro_sd_rad": float(np.sqrt(np.mean(np.concatenate(gyro) ** 2) / 3)) if gyro else None,
         "calibration": {"pairs": pairs, "recordings": len(used), "nees": float(nees_of(used, model, SIGNALS).mean()),
                         "depth": None if depth is None else asdict(depth), "motion": asdict(motion)},
     }
@@ -154,12 +151,6 @@ def extend_card(source: str | Path, path: str | Path, calibrate_on: Sequence[Rec
         raise TrainingError(f"calibration: {len(measured)} recordings do not suffice for {' and '.join(missing)}; "
                             "give more or longer ones with true depth and texture")
     return rewrite_card(source, path, {**sections, "depth_calibrated_on": _data(calibrate_on)})
-
-
-def _transforms(R: np.ndarray[Any, np.dtype[np.float64]]) -> np.ndarray[Any, np.dtype[np.float64]]:
-    T = np.broadcast_to(np.eye(4), (len(R), 4, 4)).copy()
-    T[:, :3, :3] = R
-    return T
 
 
 def _data(recordings: Sequence[Recording]) -> dict[str, Any]:

@@ -119,9 +119,9 @@ def depth_aligned_motions(recording: Recording, predictor: NetworkPredictor | st
         raise ConfigError(f"batch_size is {batch_size}, must be at least 1")
     if not isinstance(predictor, NetworkPredictor):
         predictor = predictor_for(recording, load_weights(predictor))
-    if len(recording) < 2 or not recording.has_images:
+    if len(recording) < 2 or not recording.has_any_image:
         raise RecordingError(f"recording {recording.name}: {len(recording)} frame(s), images "
-                             f"{'complete' if recording.has_images else 'missing'}; depth-aligned motions need two "
+                             f"{'there' if recording.has_any_image else 'missing'}; depth-aligned motions need two "
                              "frames and all images")
     model = _model(predictor)
     frames = (resized_rgb(recording.frame(k), predictor.image_size) for k in range(len(recording)))

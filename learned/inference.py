@@ -13,7 +13,7 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from learned.camera_rays import CameraBatch
-from learned.lie import inverse, so3_exp, so3_log, transform
+from learned.lie import halfway, inverse, so3_log
 from learned.losses.photometric import Photometric, compare
 from learned.losses.terms import masked_mean
 from learned.methods import Method
@@ -40,6 +40,36 @@ class PairEstimate:
     """(B, 8) the `SIGNALS`."""
 
 
+@dataclass(frozen=True)
+class Shots:
+    """F frames that make up B pairs."""
+
+    frames: Tensor
+    """(F, 3, H, W)."""
+    i: tuple[int, ...]
+    """B numbers of the earlier frames among them."""
+    j: tuple[int, ...]
+    """B numbers of the later ones."""
+    pair: list[int]
+    """F numbers of the pairs whose window belongs to the frame: the one it begins, or else ends."""
+
+
+def distinct(frames: Tensor) -> Shots:
+    """Pairs (B, 2, 3, H, W) told apart into frames: where a pair begins with what the one before ended with, one."""
+    shown, pair, first, second = [frames[0, 0]], [0], [0], [1]
+    for k in range(1, len(frames)):
+        shown.append(frames[k - 1, 1])
+        pair.append(k)
+        if not torch.equal(frames[k, 0], frames[k - 1, 1]):
+            pair[-1] = k - 1
+            shown.append(frames[k, 0])
+            pair.append(k)
+        first.append(len(shown) - 1)
+        second.append(len(shown))
+    shown.append(frames[-1, 1])
+    return Shots(torch.stack(shown), tuple(first), tuple(second), [*pair, len(frames) - 1])
+
+
 @torch.no_grad()
 def estimate_pairs(method: Method, frames: Tensor, vibration: Tensor | None, cameras: CameraBatch,
                    depth_kind: DepthKind) -> PairEstimate:
@@ -52,23 +82,21 @@ def estimate_pairs(method: Method, frames: Tensor, vibration: Tensor | None, cam
         cameras: B cameras of images of that size.
         depth_kind: what the depth network's numbers mean.
     """
-    out = method(frames, vibration, depth_frames=(0,), pairs=((0, 1), (1, 0)))
-    depth = out.depth[0].depth[0].float()
-    there, back = out.T_i_j[0, 1].float(), inverse(out.T_i_j[1, 0].float())
-    T = _mean(there, back)
+    shots = distinct(frames)
+    windows = None if vibration is None else vibration[shots.pair][None]
+    ahead = list(zip(shots.i, shots.j, strict=True))
+    out = method(shots.frames[None], windows, depth_frames=shots.i, pairs=[*ahead, *((j, i) for i, j in ahead)])
+    depth = torch.cat([out.depth[i].depth[0] for i in shots.i]).float()
+    there = torch.cat([out.T_i_j[i, j] for i, j in ahead]).float()
+    back = inverse(torch.cat([out.T_i_j[j, i] for i, j in ahead]).float())
+    T = halfway(there, back)
     snr = None
     if out.snr_depth:
-        every = torch.cat([out.snr_depth[0], out.snr_pose[0, 1]], 1).float()
+        every = torch.cat([torch.cat([out.snr_depth[i], out.snr_pose[i, j]], 1) for i, j in ahead]).float()
         snr = every.clamp(min=LEAST).log().mean(1).exp()
     z = to_z_depth(depth, cameras, depth_kind)
     signals = _signals(frames, depth, T, there, back, snr, cameras, depth_kind)
     return PairEstimate(T, z, snr, signals)
-
-
-def _mean(a: Tensor, b: Tensor) -> Tensor:
-    """Half-way between rigid motions (B, 4, 4): rotation along the geodesic, translation along the line."""
-    half = so3_exp(0.5 * so3_log(a[:, :3, :3].transpose(1, 2) @ b[:, :3, :3]))
-    return transform(a[:, :3, :3] @ half, 0.5 * (a[:, :3, 3] + b[:, :3, 3]))
 
 
 def _signals(frames: Tensor, depth: Tensor, T: Tensor, there: Tensor, back: Tensor, snr: Tensor | None,

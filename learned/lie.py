@@ -67,3 +67,9 @@ def inverse(T: Tensor) -> Tensor:
     """`T_b_a` (..., 4, 4) of `T_a_b`, using that the rotation part is orthonormal."""
     R_t = T[..., :3, :3].transpose(-1, -2)
     return transform(R_t, -(R_t @ T[..., :3, 3:])[..., 0])
+
+
+def halfway(a: Tensor, b: Tensor) -> Tensor:
+    """Between two rigid motions (..., 4, 4): rotation half of the geodesic, translation half of the line."""
+    half = so3_exp(0.5 * so3_log(a[..., :3, :3].transpose(-1, -2) @ b[..., :3, :3]))
+    return transform(a[..., :3, :3] @ half, 0.5 * (a[..., :3, 3] + b[..., :3, 3]))

@@ -9,6 +9,7 @@ import torch
 from numpy.typing import NDArray
 
 from learned.camera_rays import camera_batch
+from learned.gyro_update import FEWEST_SAMPLES, GyroRotations
 from learned.inference import estimate_pairs
 from learned.methods import Method
 from learned.training_source import SourceSettings, TrainingSource
@@ -44,8 +45,8 @@ class Measured:
     """(N, 4, 4) predicted [motion units]."""
     T_true_m: Array
     """(N, 4, 4) [m]."""
-    R_gyro: Array | None
-    """(N, 3, 3) integrated gyro; None without an IMU."""
+    gyro: GyroRotations | None
+    """Between the same frames; None without an IMU, or where pairs were picked out."""
     signals: Array
     """(N, S) of `learned.inference.SIGNALS`."""
     step_s: Array
@@ -95,7 +96,7 @@ def measure(method: Method, depth_kind: DepthKind, recording: Recording, first: 
         ImuError: the method looks at vibration and there is none.
     """
     height, width = method.config.image_size
-    imu = len(recording.imu) > 1
+    imu = len(recording.imu) >= FEWEST_SAMPLES
     settings = SourceSettings(height=height, width=width, imu=imu or method.config.vibration,
                               imu_samples=method.config.branch.samples)
     source = TrainingSource(recording, settings)
@@ -116,6 +117,6 @@ def measure(method: Method, depth_kind: DepthKind, recording: Recording, first: 
         recording.name, frames[:-1].permute(0, 2, 3, 1).numpy(), source.usable[0].numpy(),
         torch.cat([part.z_depth_i[:, 0] for part in parts]).numpy(), depth_true,
         torch.cat([part.T_i_j for part in parts]).double().numpy(), truth.T_i_j.numpy(),
-        source.rotations(index) if settings.imu else None,
+        GyroRotations(recording, first, end) if imu else None,
         torch.cat([part.signals for part in parts]).double().numpy(), np.diff(recording.frame_t_s[index]),
         source.camera)

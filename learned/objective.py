@@ -5,7 +5,7 @@ No truth enters. What the gyro says about rotation is a measurement; it may take
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 
 import torch
@@ -15,7 +15,7 @@ from torch import Tensor, nn
 from learned.camera_rays import CameraBatch
 from learned.dataset import TripletBatch
 from learned.errors import NetworkInputError
-from learned.lie import so3_log, transform
+from learned.lie import halfway, inverse, so3_log, transform
 from learned.losses.appearance_flow import (
     AF_SFM,
     ENDODAC,
@@ -107,8 +107,10 @@ class Objective(nn.Module):
         depth = torch.stack([out.depth[k].depth[0] for k in FRAMES], 1)
         motions = out.T_i_j if len(out.T_i_j) == 4 else both_directions(out.T_i_j)
         rotation = self._rotation_loss(out, batch)
-        snippet = Snippet(batch.images, depth, {pair: self._in_warp(T, pair, batch) for pair, T in motions.items()},
-                          batch.cameras, batch.usable[:, None].expand(-1, 3, -1, -1, -1))
+        in_warp = {pair: self._in_warp(T.float(), pair, batch) for pair, T in motions.items()}
+        in_warp = tied(in_warp) if self.config.tied_motions else in_warp
+        usable = batch.usable[:, None].expand(-1, 3, -1, -1, -1)
+        snippet = Snippet(batch.images, depth, in_warp, batch.cameras, usable)
         terms = consistency_loss(snippet, self._consistency_settings(batch))
         parts = dict(terms.parts) | _snr(out) | {"gyro_rotation": rotation.detach(), "step_length": _length(motions)}
         total = terms.total + self.config.rotation_weight * rotation
@@ -195,6 +197,12 @@ class Objective(nn.Module):
         """`T_target_source` (B, S, 4, 4)."""
         both = both_directions(out.T_i_j)
         return torch.stack([self._in_warp(both[TARGET, source], (TARGET, source), batch) for source in SOURCES], 1)
+
+
+def tied(motions: Mapping[tuple[int, int], Tensor]) -> dict[tuple[int, int], Tensor]:
+    """One motion a pair: `T_i_j` (B, 4, 4) half-way between itself and the inverse of `T_j_i`, for both directions."""
+    forward = {(i, j): halfway(T, inverse(motions[j, i])) for (i, j), T in motions.items() if i < j}
+    return forward | {(j, i): inverse(T) for (i, j), T in forward.items()}
 
 
 def gyro_rotation(batch: TripletBatch, pair: tuple[int, int]) -> Tensor:

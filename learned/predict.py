@@ -74,7 +74,8 @@ def predict(
         batch_size: pairs per call of the predictor; changes speed, not results. A batch that the accelerator's memory
             does not hold is halved, and `meta` says what fitted (`batch_size_that_fitted`).
         rotation: "network": what the images say, for a graph that fuses the gyro itself; "gyro": corrected by the
-            integrated gyro, far better alone, but such motions must not meet the same gyro again (`meta` says so).
+            integrated gyro, its bias estimated from gravity and the images; far better alone, but such motions must
+            not meet the same IMU again (`meta` says so).
         depth_dir: where to write a depth map of every frame (layout: `learned.depth_maps`), metric at the
             prior scale. The last frames open no pair: they are shown twice and only their depth is kept.
         depth_unit_m: metres per count of the depth maps.
@@ -90,9 +91,9 @@ def predict(
         WeightsError: weights that are missing, damaged, or a pickle.
         CameraError: no camera, or one too far from those that the weights were trained on.
         RecordingError: frames without images, too few frames, frames of different sizes, or no pair that can be read.
-        ImuError: the predictor needs an IMU log that is absent or does not cover the frames.
+        ImuError: the predictor or `rotation` needs an IMU log that is absent or does not cover the frames.
         PredictionError: the predictor's output breaks its contract, naming the frames.
-        ConfigError: an unknown `rotation`, or "gyro" without weights that know the gyro's error.
+        ConfigError: an unknown `rotation`, or a batch size below 1.
         OutputError: the depth maps cannot be written.
     """
     if batch_size < 1:
@@ -100,7 +101,7 @@ def predict(
     if predictor is None or isinstance(predictor, (str, Path)):
         predictor = predictor_for(recording, load_weights(predictor))
     _check(recording, predictor)
-    gyro = _gyro(recording, predictor) if _wants_gyro(rotation) else None
+    gyro = GyroRotations(recording) if _wants_gyro(rotation) else None
     t = recording.frame_t_s
     meta: dict[str, Any] = {"source": "learned", "predictor": dict(predictor.card), "library_version": _version(),
                             "rotation": rotation}
@@ -124,7 +125,9 @@ def predict(
     if run.smallest_batch < batch_size:
         meta["batch_size_that_fitted"] = run.smallest_batch
     if gyro is not None:
-        T, cov, meta["pairs_without_gyro"] = gyro.correct(T, cov, i, j)
+        corrected = gyro.correct(T, cov, i, j)
+        T, cov = corrected.T_i_j, corrected.cov
+        meta |= corrected.meta()
     prediction = Prediction(
         t_i_s=t[i], t_j_s=t[j], T_i_j=T, cov=cov,
         scale_log_mean=predictor.scale_log_mean, scale_log_sd=predictor.scale_log_sd,
@@ -168,14 +171,6 @@ def _wants_gyro(rotation: str) -> bool:
     return rotation == "gyro"
 
 
-def _gyro(recording: Recording, predictor: Predictor) -> GyroRotations:
-    sd = predictor.weights.card.get("gyro_sd_rad") if isinstance(predictor, NetworkPredictor) else None
-    if sd is None:
-        raise ConfigError("rotation='gyro': only weights calibrated with an IMU know how wrong a gyro's rotation is; "
-                          "use rotation='network'")
-    return GyroRotations(recording, float(sd))
-
-
 def _check(recording: Recording, predictor: Predictor) -> None:
     baselines = predictor.baselines
     if not baselines or min(baselines) < 1 or len(set(baselines)) != len(baselines):
@@ -184,7 +179,7 @@ def _check(recording: Recording, predictor: Predictor) -> None:
         raise RecordingError(
             f"recording {recording.name}: {len(recording)} frame(s), too few for a pair {min(baselines)} apart"
         )
-    if not recording.has_images:
+    if not recording.has_any_image:
         raise RecordingError(
             f"recording {recording.name}: images are missing; restore cam0/data, or give motions with `--motions`"
         )

@@ -20,10 +20,10 @@ from learned.evaluation import (
     trivial_depths,
     trivial_motions,
 )
-from learned.gyro_update import with_gyro
+from learned.gyro_update import CorrectedMotions
 from learned.inference import SIGNALS
 from learned.measured import Array, Measured, measure
-from learned.uncertainty import uncertainty_from_dict
+from learned.uncertainty import UncertaintyModel, uncertainty_from_dict
 from learned.weights import Weights
 from vio.recording import Recording
 
@@ -38,6 +38,8 @@ class Evaluation:
     """Per name, "network" first, then "network with gyro" where there is one."""
     gyro_alone_deg: float | None
     """Mean rotation error of the integrated gyro, its bias left in."""
+    gyro_unbiased_deg: float | None
+    """The same, freed of the bias that gravity and the network's rotations tell."""
     nees: float | None
     """Mean per degree of freedom at each recording's own scale; None for weights without covariances."""
     scale_error: float
@@ -74,23 +76,34 @@ def evaluation_of(measured: Sequence[Measured], weights: Weights, prior: Sequenc
         found = {name: depth_score(values, measured) for name, values in guesses.items()}
         depth = {name: score for name, score in found.items() if score is not None}
     motions = {"network": [m.T_i_j for m in measured]}
-    if all(m.R_gyro is not None for m in measured) and weights.card.get("gyro_sd_rad"):
-        motions["network with gyro"] = [corrected(m, weights) for m in measured]
-    motion = {name: motion_score(values, measured) for name, values in {**motions, **trivial_motions(measured)}.items()}
-    gyro = [angle_deg(m.R_gyro, m.T_true_m) for m in measured if m.R_gyro is not None]
     model = weights.card["uncertainty"]
+    gyro, freed = _gyro_error_deg(measured, [np.zeros(3)] * len(measured)), None
+    if gyro is not None and model is not None:
+        updates = [corrected(m, uncertainty_from_dict(model)) for m in measured]
+        motions["network with gyro"] = [update.T_i_j for update in updates]
+        freed = _gyro_error_deg(measured, [update.bias.bias_rad_s for update in updates])
+    motion = {name: motion_score(values, measured) for name, values in {**motions, **trivial_motions(measured)}.items()}
     nees = None if model is None else float(nees_of(measured, uncertainty_from_dict(model), SIGNALS).mean())
     scales = np.array([m.log_scale for m in measured if np.isfinite(m.log_scale)]) - weights.card["scale_log_mean"]
-    return Evaluation(depth, motion, float(np.mean(np.concatenate(gyro))) if gyro else None, nees,
+    return Evaluation(depth, motion, gyro, freed, nees,
                       float(np.sqrt(np.mean(scales**2))) if len(scales) else float("nan"),
                       sum(len(m) for m in measured), len(measured))
 
 
-def corrected(m: Measured, weights: Weights) -> Array:
-    """Motions (N, 4, 4) after the gyro's update."""
-    assert m.R_gyro is not None
-    cov = uncertainty_from_dict(weights.card["uncertainty"]).covariance(m.signals, SIGNALS)
-    return with_gyro(m.T_i_j, cov, m.R_gyro, float(weights.card["gyro_sd_rad"]))[0]
+def corrected(m: Measured, model: UncertaintyModel) -> CorrectedMotions:
+    """Motions after the gyro's update."""
+    assert m.gyro is not None
+    k = np.arange(len(m))
+    return m.gyro.correct(m.T_i_j, model.covariance(m.signals, SIGNALS), k, k + 1)
+
+
+def _gyro_error_deg(measured: Sequence[Measured], biases: Sequence[Array]) -> float | None:
+    """Mean rotation error of the gyros freed of some biases; None where a recording has no gyro."""
+    gyros = [m.gyro for m in measured if m.gyro is not None]
+    if len(gyros) < len(measured):
+        return None
+    return float(np.mean(np.concatenate([angle_deg(gyro.between_frames(bias), m.T_true_m)
+                                         for gyro, bias, m in zip(gyros, biases, measured, strict=True)])))
 
 
 def depth_rows(evaluation: Evaluation) -> list[list[str]]:
@@ -116,6 +129,9 @@ def format_evaluation(evaluation: Evaluation) -> str:
     notes = [f"{evaluation.pairs} pairs of {evaluation.recordings} recordings"]
     if evaluation.gyro_alone_deg is not None:
         notes.append(f"gyro alone, bias left in: {evaluation.gyro_alone_deg:.2f}° per step")
+    if evaluation.gyro_unbiased_deg is not None:
+        notes.append("gyro alone, its bias estimated from gravity and the network: "
+                     f"{evaluation.gyro_unbiased_deg:.3f}°")
     if evaluation.nees is not None:
         notes.append(f"motion NEES per degree of freedom {evaluation.nees:.2f} (honest: 1), scale off its prior by "
                      f"{100 * evaluation.scale_error:.0f} % (rms)")

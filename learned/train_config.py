@@ -48,6 +48,10 @@ class TrainConfig:
     """Of the running mean of the weights, which is what gets validated and shipped; 0 = the weights themselves."""
     rotation_from: RotationFrom = "network"
     """Whose rotation warps the images."""
+    tied_motions: bool = False
+    """Warp both directions of a pair by one motion, the mean of the two that the network tells. Told apart, each takes
+    the scale of its own target's depth, and nothing but L_g holds the depths of two frames together: measured, every
+    image's median depth came out as one unit, however near the wall."""
     rotation_weight: float = 0.0
     """Of the network's rotation's L1 distance from the gyro's."""
     unit_depth_weight: float = 0.0
@@ -110,8 +114,8 @@ PAPER_RECIPE: dict[str, Any] = {}
 """Adam 1e-4, batch 4: the defaults."""
 MEASURED_RECIPE: dict[str, Any] = {
     "learning_rate": 1e-3, "warm_up_steps": 50, "schedule": "cosine", "clip_norm": 1.0, "ema_decay": 0.995,
-    "rotation_from": "gyro", "rotation_weight": 1.0, "unit_depth_weight": 0.2, "light_start_steps": 150,
-    "depth_kind": "range", "precision": "bfloat16", "channels_last": True,
+    "rotation_from": "gyro", "tied_motions": True, "rotation_weight": 1.0, "unit_depth_weight": 0.2,
+    "light_start_steps": 150, "depth_kind": "range", "precision": "bfloat16", "channels_last": True,
 }
 """What was measured to train our own method within minutes: ten times the paper's rate, the gyro in the warp. With
 fewer than four triplets a process, consider `freeze_batch_norm` once there are weights to start from."""

@@ -30,6 +30,7 @@ from learned.objective import Objective
 from learned.train_config import TrainConfig, train_config_to_dict
 from learned.train_log import TrainLog
 from learned.training_source import SourceSettings
+from learned.weights import fill_method
 from vio.atomic import atomic_write
 from vio.recording import Recording
 
@@ -68,7 +69,8 @@ class _EarlyStop:
 
 
 def train(recordings: Sequence[Recording], config: TrainConfig, out: str | Path, *, device: str | None = None,
-          progress: Progress | None = None, start_from: Mapping[str, Tensor] | None = None) -> TrainedRun:
+          progress: Progress | None = None, start_from: Mapping[str, Tensor] | None = None,
+          alone: bool = False) -> TrainedRun:
     """Train, or go on training.
 
     Under `torchrun` all processes call this; the first writes the files.
@@ -80,14 +82,16 @@ def train(recordings: Sequence[Recording], config: TrainConfig, out: str | Path,
         device: "cpu" or "cuda"; None = cuda where there is one.
         progress: called with (steps done, steps in all) after every step.
         start_from: weights to start a new run with, by name; None = drawn from the seed.
+        alone: train in this process alone, though there are others.
 
     Raises:
         CheckpointError: the folder's checkpoint is damaged, or of a run with other decisions.
         RecordingError, ImuError: recordings that cannot be trained on.
+        WeightsError: start weights of another method.
         TrainingError: gradients stay without finite values.
         OutputError: the folder cannot be written.
     """
-    with team(device) as members:
+    with team(device, alone) as members:
         trainer = Trainer(recordings, config, Path(out), members, start_from)
         trainer.resume()
         trainer.run(progress)
@@ -116,7 +120,8 @@ class Trainer:
         if config.method.vibration:
             self.method.fit_vibration_normalisation(_windows(self.data))
         if self.start_from is not None:
-            self.method.load_state_dict(dict(self.start_from))
+            fill_method(self.method, self.start_from, "start weights",
+                        "is trained; give weights of that method, width and fusion")
         layout = torch.channels_last if config.channels_last else torch.contiguous_format
         self.method.to(members.device, memory_format=layout)  # type: ignore[call-overload]
         self.objective = Objective(self.method, config).train()

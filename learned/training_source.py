@@ -66,7 +66,7 @@ class TrainingSource:
         if camera is None:
             raise RecordingError(f"recording {recording.name}: no camera is calibrated, and views are warped through "
                                  "it; add intrinsics to cam0/sensor.yaml")
-        if not recording.has_images:
+        if not recording.has_any_image:
             raise RecordingError(f"recording {recording.name}: images are missing; restore cam0/data")
         self.recording, self.settings = recording, settings
         self.camera: Camera = camera.resized(settings.width, settings.height)

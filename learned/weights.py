@@ -109,7 +109,7 @@ def load_weights(path: str | Path | None = None) -> Weights:
         method = assemble(config_from_dict(card["method"], CONFIGS))
     except ConfigError as error:
         raise WeightsError(f"weights {name}: {error}; this version cannot build that method") from None
-    _fill(method, tensors, name)
+    fill_method(method, tensors, f"weights {name}", "the card describes; get the file again")
     return Weights(method.eval(), card, name)
 
 
@@ -144,15 +144,16 @@ def _read(path: Path) -> tuple[dict[str, Tensor], dict[str, str]]:
     name = path.name
     try:
         with path.open("rb") as file:
-            start = file.read(9)
+            start = file.read(2)
     except OSError as error:
         raise WeightsError(f"weights {name}: {error.strerror or 'cannot be read'}; give a .safetensors file") from None
-    if start[:2] == b"PK" or start[:1] == b"\x80":
-        raise WeightsError(f"weights {name}: a pickle, which can run code when it is opened; give safetensors")
     try:
         with safetensors.safe_open(path, framework="pt") as opened:
             return {key: opened.get_tensor(key) for key in list(opened.keys())}, dict(opened.metadata() or {})
     except (safetensors.SafetensorError, OSError):
+        if start == b"PK" or start[:1] == b"\x80":  # only of what is no safetensors: its header may begin so too
+            raise WeightsError(f"weights {name}: a pickle, which can run code when it is opened; give safetensors"
+                               ) from None
         raise WeightsError(f"weights {name}: damaged, or no safetensors file; get it again") from None
 
 
@@ -171,16 +172,26 @@ def _card(metadata: Mapping[str, str], name: str) -> dict[str, Any]:
     return dict(card)
 
 
-def _fill(method: Method, tensors: Mapping[str, Tensor], name: str) -> None:
+def fill_method(method: Method, tensors: Mapping[str, Tensor], what: str, remedy: str) -> None:
+    """Put tensors into a method's networks, all or none.
+
+    Args:
+        method: whose weights are replaced.
+        tensors: by name.
+        what: they are called in a refusal.
+        remedy: what to do about tensors of another method.
+
+    Raises:
+        WeightsError: names or shapes that are not the method's, or values that are not finite.
+    """
     wanted = method.state_dict()
     missing, extra = sorted(set(wanted) - set(tensors)), sorted(set(tensors) - set(wanted))
     wrong = [key for key in wanted if key in tensors and tensors[key].shape != wanted[key].shape]
     if missing or extra or wrong:
         first = (missing or extra or wrong)[0]
-        what = "lack" if missing else "have an unknown" if extra else "have another shape of"
-        raise WeightsError(f"weights {name}: they {what} {first}, so they are not of the method that the card "
-                           "describes; get the file again")
+        how = "lack" if missing else "have an unknown" if extra else "have another shape of"
+        raise WeightsError(f"{what}: they {how} {first}, so they are not of the method that {remedy}")
     bad = [key for key, value in tensors.items() if value.is_floating_point() and not torch.isfinite(value).all()]
     if bad:
-        raise WeightsError(f"weights {name}: {bad[0]} is not finite; train again, or store in float32")
+        raise WeightsError(f"{what}: {bad[0]} is not finite; train again, or store in float32")
     method.load_state_dict({key: value.to(wanted[key].dtype) for key, value in tensors.items()})

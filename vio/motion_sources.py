@@ -2,8 +2,10 @@
 
 Two sources that look at the same images make partly the same errors. Where both claim covariance C and their errors
 correlate by ρ, their difference Log(T_a⁻¹ T_b) has covariance 2 (1 - ρ) C: how much closer the sources are to each
-other than independent ones would be measures ρ. The mean of n motions of one pair of frames has variance
-C (1 + (n - 1) ρ) / n, which n factors give when each carries C (1 + (n - 1) ρ).
+other than independent ones would be measures ρ. Where a source's `meta` declares how its errors go with the other's, as
+weights that were calibrated for both do, that is taken instead: it was measured beside truth, and for rotation and
+translation apart. The mean of n motions of one pair of frames has variance C (1 + (n - 1) ρ) / n, which n factors give
+when each carries C (1 + (n - 1) ρ).
 """
 
 from __future__ import annotations
@@ -41,7 +43,7 @@ class MergedMotions:
     log_ratio: Array
     """(K,) ln(unit of source k / unit of the first)."""
     correlation: Array
-    """(K, K) of the errors of two sources, 0 to 1; 1 on the diagonal."""
+    """(K, K, 2) of the rotation and translation errors of two sources, 0 to 1; 1 where a source meets itself."""
 
 
 def merge_motions(sources: Sequence[RelativeMotions]) -> MergedMotions:
@@ -58,13 +60,15 @@ def merge_motions(sources: Sequence[RelativeMotions]) -> MergedMotions:
     shared = {(a, b): _shared(sources[a], sources[b]) for a, b in combinations(range(len(sources)), 2)}
     ratio = np.array([0.0, *(_log_ratio(sources[0], sources[k], *shared[0, k]) for k in range(1, len(sources)))])
     same_unit = [_scaled(motions, r) for motions, r in zip(sources, ratio, strict=True)]
-    correlation = np.eye(len(sources))
+    correlation = np.repeat(np.eye(len(sources))[..., None], 2, axis=2)
     for (a, b), (at_a, at_b) in shared.items():
-        correlation[a, b] = correlation[b, a] = _correlation(same_unit[a], same_unit[b], at_a, at_b)
+        declared = _declared(sources[a], sources[b])
+        found = _correlation(same_unit[a], same_unit[b], at_a, at_b) if declared is None else declared
+        correlation[a, b] = correlation[b, a] = found
     inflation = _inflations(same_unit, shared, correlation)
     mean, sd = _prior(sources, ratio)
     joined = {name: np.concatenate([getattr(m, name) for m in same_unit]) for name in ("t_i_s", "t_j_s", "T_i_j")}
-    cov = np.concatenate([m.cov * f[:, None, None] for m, f in zip(same_unit, inflation, strict=True)])
+    cov = np.concatenate([m.cov * f[:, :, None] * f[:, None, :] for m, f in zip(same_unit, inflation, strict=True)])
     snr = None if any(m.snr is None for m in sources) else np.concatenate([m.snr for m in sources if m.snr is not None])
     order = np.argsort(joined["t_i_s"], kind="stable")
     source = np.repeat(np.arange(len(sources)), [len(m) for m in sources])
@@ -108,6 +112,22 @@ def _scaled(motions: RelativeMotions, log_ratio: float) -> RelativeMotions:
                            motions.scale_log_mean - log_ratio, motions.scale_log_sd, motions.snr, motions.meta)
 
 
+def _declared(a: RelativeMotions, b: RelativeMotions) -> Array | None:
+    """(2,) correlations of rotation and translation errors that one source knows of itself and the other's network."""
+    for one, other in ((a, b), (b, a)):
+        known, weights = one.meta.get("network_correlation"), _weights(one)
+        of_network = other.meta.get("rotation") == "network" and "network_correlation" not in other.meta
+        if known is not None and weights is not None and weights == _weights(other) and of_network:
+            return np.clip([float(known["rotation"]), float(known["translation"])], 0.0, 1.0)
+    return None
+
+
+def _weights(motions: RelativeMotions) -> str | None:
+    """Digest of the weights that measured them."""
+    predictor = motions.meta.get("predictor")
+    return predictor.get("sha256") if isinstance(predictor, dict) else None
+
+
 def _correlation(a: RelativeMotions, b: RelativeMotions, at_a: Indices, at_b: Indices) -> float:
     """Of the errors of shared motions; 0 where too few are shared to tell."""
     if len(at_a) < LEAST_SHARED:
@@ -121,12 +141,12 @@ def _correlation(a: RelativeMotions, b: RelativeMotions, at_a: Indices, at_b: In
 
 def _inflations(sources: list[RelativeMotions], shared: dict[tuple[int, int], tuple[Indices, Indices]],
                 correlation: Array) -> list[Array]:
-    """Per source (N,) factors on the covariances: 1 + the correlations with the others that measured the same pair."""
-    out = [np.ones(len(motions)) for motions in sources]
+    """Per source (N, 6) factors on the sds: √(1 + the correlations with the others that measured the same pair)."""
+    out = [np.ones((len(motions), 2)) for motions in sources]
     for (a, b), (at_a, at_b) in shared.items():
         np.add.at(out[a], at_a, correlation[a, b])
         np.add.at(out[b], at_b, correlation[a, b])
-    return out
+    return [np.sqrt(np.repeat(factor, 3, axis=1)) for factor in out]
 
 
 def _prior(sources: Sequence[RelativeMotions], log_ratio: Array) -> tuple[float, float]:

@@ -77,7 +77,7 @@ def measure_recording(recording: Recording, prior: ScalePrior | None = None) -> 
         RecordingError: an image cannot be read.
     """
     camera = recording.calibration.camera
-    if camera is None or not recording.has_images:
+    if camera is None or not recording.has_any_image:
         raise TrackingError(f"recording {recording.name}: classical motions need camera intrinsics and all image files")
     return measure_motions(track_recording(recording), camera, recording.frame_t_s, prior=prior)
 

@@ -122,6 +122,11 @@ class Recording:
         return self.video is not None or all(path is not None and path.is_file() for path in self.frame_paths)
 
     @property
+    def has_any_image(self) -> bool:
+        """Whether at least one frame has its image; the others' are named when they are read."""
+        return self.video is not None or any(path is not None and path.is_file() for path in self.frame_paths)
+
+    @property
     def has_depth(self) -> bool:
         """Whether z-depth in metres can be had for at least one frame."""
         return self.stored_depth.metric and self.has_depth_images

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusion.result import Refinement
+from fusion.summary import loops_in_words
 
 Array = NDArray[np.float64]
 
@@ -146,6 +147,8 @@ def sentences(
     out.append(("IMU", _imu(refinement, *(mean_biases or own))))
     out.append(("Camera and IMU", _camera_imu(refinement)))
     out.append(("Motions", _motions(refinement)))
+    if (summary.get("loops") or {}).get("proposed"):
+        out.append(("Loops", _begun(loops_in_words(summary["loops"]))))
     if within_3_sigma is not None:
         out.append(("Certainty", f"{100 * within_3_sigma:.1f} % of the positions lie inside their claimed 3-sigma "
                                "ellipsoid, first poses laid together; an honest claim holds for 99.7 %."))

@@ -12,6 +12,7 @@ from learned.benchmark.markdown import markdown
 from learned.benchmark.results import table_of
 from learned.benchmark.runs import Progress, Run, finish, runs_of
 from learned.benchmark.tables import BASELINE, Variant, plan_table
+from learned.distributed import shares
 from learned.methods import assemble
 from vio.atomic import atomic_write
 from vio.errors import OutputError
@@ -30,6 +31,9 @@ class Silent:
 def run_table(table: str, data: str | Path, budget: str, out: str | Path, *, seeds: int | None = None,
               method: str = BASELINE, device: str | None = None, progress: Progress | None = None) -> dict[str, Any]:
     """Measure a table, or go on measuring it, and write `OUT/TABLE.json` and `OUT/TABLE.md`.
+
+    Under `torchrun` the processes share the runs: each trains whole runs by itself, so that a table does not depend on
+    how many processes there are, and the first one writes it.
 
     Args:
         table: of `TABLES`.
@@ -59,12 +63,15 @@ def run_table(table: str, data: str | Path, budget: str, out: str | Path, *, see
     tell("checking the data")
     found.check(_used(runs), tell.count)
     _check_buildable(plan.variants, size)
-    parts = {}
-    for k, run in enumerate(runs):
-        tell(f"run {k + 1} of {len(runs)}: {run.name}")
-        parts[run.variant, run.seed] = finish(run, found, out, device, tell)
+    sharing = shares(f"{table} {out.resolve()}")
+    for k in sharing.take(len(runs)):
+        tell(f"run {k + 1} of {len(runs)}: {runs[k].name}")
+        finish(runs[k], found, out, device, tell)
+    sharing.wait()
+    parts = {(run.variant, run.seed): finish(run, found, out, device, tell) for run in runs}
     result = table_of(plan, size, found, runs, parts)
-    _write(result, out)
+    if sharing.leads:
+        _write(result, out)
     return result
 
 

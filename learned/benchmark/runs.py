@@ -91,7 +91,7 @@ def finish(run: Run, data: DataSet, out: Path, device: str | None, progress: Pro
     missing = [condition for condition in files if condition.name not in found]
     if missing:
         folder = out / "training" / run.name
-        trained = train(recordings, config, folder, device=device, progress=progress.count)
+        trained = train(recordings, config, folder, device=device, progress=progress.count, alone=True)
         for condition, judged in _judged(run, trained, data, missing, progress):
             part = {"schema": SCHEMA, "run": run.name, "condition": condition.name, "decisions": wanted,
                     "versions": versions(), **judged}

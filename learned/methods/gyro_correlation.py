@@ -37,9 +37,13 @@ class GyroCorrelationConfig(MethodConfig):
     layers: int = 18
     """Of the depth ResNet, at half the published width (`width` 2 is the published one)."""
     radius: int = 4
-    """Cells of a quarter resolution that a match may lie away: 16 px at 128 x 128."""
+    """Cells that a match may lie away."""
+    correlation_maps: int = 1
+    """Of a quarter, an eighth and a sixteenth of the image's resolution: reach 16, 32 and 64 px at radius 4."""
     image_size: tuple[int, int] = (128, 128)
     """Measured to train well; larger for finer detail."""
+    whole_image: bool = False
+    """One number per image, of the encoder's mean features, says how near everything is."""
     depth_range: DepthRange = field(default_factory=lambda: DepthRange(0.1, 4.0))
     """Units of 20 mm."""
     pose: PoseParametrisation = field(
@@ -62,7 +66,8 @@ def networks(config: GyroCorrelationConfig, weights: str | Path | None) -> Netwo
     decoder.start_heads(HEAD_START_SD, _logit(start))
     if weights is not None:
         load_encoder(encoder, weights)
-    return Networks(DepthNetwork(encoder, decoder, full_size=True), CorrelationPoseNetwork(base, config.radius))
+    pose = CorrelationPoseNetwork(base, config.radius, config.correlation_maps)
+    return Networks(DepthNetwork(encoder, decoder, full_size=True, whole_image=config.whole_image), pose)
 
 
 def _logit(value: float) -> float:

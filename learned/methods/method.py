@@ -69,7 +69,8 @@ class Method(nn.Module):
             frames: (B, F, 3, H, W) in 0..1, channels R, G, B; F = 3 in training, 2 for a pair.
             vibration: (B, 6, 40) one window for all frames, or (B, F, 6, 40) one per frame; gyro [rad/s], then specific
                 force [m/s²]. A pair uses the window of its earlier frame. None for a vision-only method.
-            depth_frames: whose depth; None = as configured, `()` = none.
+            depth_frames: whose depth; None = as configured, `()` = none. Motions in depths (`PoseParametrisation`)
+                bring the depth of their first frames with them.
             pairs: which T_i_j; None = as configured, `()` = none.
 
         Raises:
@@ -79,8 +80,10 @@ class Method(nn.Module):
         pairs = self.config.pairs if pairs is None else tuple(pairs)
         self._check(frames, vibration, [*depth_frames, *(k for pair in pairs for k in pair)])
         of_depth, of_pose = self._vibration_features(vibration, frames.shape[1])
+        if self.config.pose.in_depths:
+            depth_frames = tuple(sorted({*depth_frames, *(i for i, _ in pairs)}))
         depth, snr_depth = self._depths(frames, of_depth, depth_frames)
-        motions, snr_pose, intrinsics = self._motions(frames, of_pose, pairs)
+        motions, snr_pose, intrinsics = self._motions(frames, of_pose, pairs, depth)
         return MethodOutput(depth, motions, snr_depth, snr_pose, intrinsics)
 
     def fit_vibration_normalisation(self, windows: Tensor) -> None:
@@ -113,13 +116,15 @@ class Method(nn.Module):
         return depth, snrs
 
     def _motions(
-        self, frames: Tensor, features: Tensor | None, pairs: Sequence[tuple[int, int]]
+        self, frames: Tensor, features: Tensor | None, pairs: Sequence[tuple[int, int]], depth: dict[int, DepthPyramid]
     ) -> tuple[dict[tuple[int, int], Tensor], dict[tuple[int, int], Tensor], dict[tuple[int, int], Tensor]]:
         if not pairs:
             return {}, {}, {}
         chosen = None if features is None else features[:, [min(pair) for pair in pairs]]
         out: PairMotion = self.pose(frames, [self.config.pose.images(i, j) for i, j in pairs], chosen)
-        motions = {(i, j): self.config.pose.motion(out.raw[:, n], i, j) for n, (i, j) in enumerate(pairs)}
+        of_frame = {i: pyramid.depth[0] for i, pyramid in depth.items()}
+        motions = {(i, j): self.config.pose.motion(out.raw[:, n], i, j, of_frame.get(i))
+                   for n, (i, j) in enumerate(pairs)}
         snr = {} if out.snr is None else {pair: out.snr[:, n] for n, pair in enumerate(pairs)}
         return motions, snr, self._intrinsics(out, pairs, (frames.shape[-2], frames.shape[-1]))
 

@@ -60,6 +60,11 @@ class PoseParametrisation:
     with "i_then_j", and of the first to the second with "j_then_i". "temporal" shows the earlier frame first, maps its
     points to the later camera, and inverts where the other direction is wanted."""
 
+    in_depths: bool = False
+    """The translation of T_i_j is a share of the typical depth of frame i, which is what two images show. In units of
+    its own, a pose network has to learn how near everything is together with the depth network, or the images no longer
+    match: measured, neither began, and every image's median depth came out as one unit."""
+
     def __post_init__(self) -> None:
         for value, known in ((self.rotation, ROTATIONS), (self.order, ORDERS), (self.pair_order, PAIR_ORDERS)):
             if value not in known:
@@ -73,10 +78,20 @@ class PoseParametrisation:
             return min(i, j), max(i, j)
         return (i, j) if self.pair_order == "i_then_j" else (j, i)
 
-    def motion(self, raw: Tensor, i: int, j: int) -> Tensor:
-        """Raw numbers (N, 6) of the images in that order → T_i_j (N, 4, 4) in motion units."""
+    def motion(self, raw: Tensor, i: int, j: int, depth_i: Tensor | None = None) -> Tensor:
+        """Raw numbers (N, 6) of the images in that order → T_i_j (N, 4, 4) in motion units.
+
+        Args:
+            raw: (N, 6).
+            i: number of the frame whose camera T_i_j is told in.
+            j: number of the other.
+            depth_i: (N, 1, H, W) of frame i, wanted with `in_depths`; its geometric mean is the typical depth.
+        """
         numbers = self.scale * (raw.float() if raw.dtype in (torch.float16, torch.bfloat16) else raw)
         first, second = numbers[:, :3], numbers[:, 3:]
         turn, shift = (first, second) if self.order == "rotation_first" else (second, first)
+        if self.in_depths:
+            assert depth_i is not None, "a translation in depths needs the depth of frame i"
+            shift = shift * depth_i.to(shift.dtype).log().mean((1, 2, 3)).exp()[:, None]
         T = transform(ROTATIONS[self.rotation](turn), shift)
         return inverse(T) if self.pair_order == "temporal" and i < j else T

@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 from fusion import chain, joint
 from fusion.chain import DIM, ChainSystem
 from fusion.chain_engine import ChainEngine
+from fusion.chain_far import FarFactors
 from fusion.config import RefineConfig
 from fusion.graph import read_log_scales, read_states
 from fusion.inertial import preintegrate_steps
@@ -122,10 +123,12 @@ def test_the_gradient_is_the_slope_of_the_cost(problem, seed, spans, huber):
     assert slope == pytest.approx(-float(parts.sum()), rel=1e-4, abs=1e-4 * np.abs(parts).sum())
 
 
-@pytest.mark.parametrize("case", ["neighbours", "wide", "gap", "held"])
+@pytest.mark.parametrize("case", ["neighbours", "wide", "loops", "gap", "held"])
 def test_a_chain_ends_where_gtsam_ends(short, problem, case):
     if case == "wide":
         problem = widened(problem, (2, 3))
+    if case == "loops":
+        problem = widened(problem, (2, 20, 31))
     if case == "gap":
         imu = with_gap(short.recording.imu, 4.0, 1.5)
         holed = build_problem(replace(short.recording, imu=imu), short.motions)
@@ -149,8 +152,9 @@ def test_a_chain_ends_where_gtsam_ends(short, problem, case):
 
 
 @settings(max_examples=12)
-@given(seed=st.integers(0, 1000), nodes=st.integers(2, 23), reach=st.integers(1, 4), stops=st.integers(2, 9))
-def test_solution_and_marginals_equal_dense_algebra(seed, nodes, reach, stops):
+@given(seed=st.integers(0, 1000), nodes=st.integers(2, 23), reach=st.integers(1, 4), stops=st.integers(2, 9),
+       loops=st.integers(0, 13))
+def test_solution_and_marginals_equal_dense_algebra(seed, nodes, reach, stops, loops):
     rng = np.random.default_rng(seed)
     system = ChainSystem(nodes, reach)
     dense, gradient = np.zeros(2 * [nodes * DIM]), np.zeros(nodes * DIM)
@@ -178,6 +182,10 @@ def test_solution_and_marginals_equal_dense_algebra(seed, nodes, reach, stops):
     for c in range(DIM):
         system.add_everywhere(c, 0.5)
     dense += 0.5 * np.eye(len(dense))
+    if loops:
+        rows, b = add_far(system, loops, rng)
+        dense += rows.T @ rows
+        gradient += rows.T @ b
     factor = system.factor()
     np.testing.assert_allclose(factor.solve().ravel(), np.linalg.solve(dense, gradient), atol=1e-9)
     with pytest.MonkeyPatch.context() as patch:
@@ -188,6 +196,42 @@ def test_solution_and_marginals_equal_dense_algebra(seed, nodes, reach, stops):
     for k in range(nodes):
         np.testing.assert_allclose(cov[k], inverse[k * DIM:(k + 1) * DIM, k * DIM:(k + 1) * DIM], atol=1e-10)
     assert len(samples.node) == min(stops, nodes) and samples.xi.shape == (3, len(samples.node), 6)
+
+
+def add_far(system, count, rng):
+    """Factors between any two frames; their rows (6 count, n) and right-hand side."""
+    ends = np.sort([rng.choice(system.nodes, 2, replace=False) for _ in range(count)], axis=1)
+    A_i, A_j, b = rng.standard_normal((count, 6, 7)), rng.standard_normal((count, 6, 7)), rng.random((count, 6))
+    system.far = FarFactors(ends[:, 0], ends[:, 1], A_i, A_j, b)
+    rows = np.zeros((count, 6, system.nodes, DIM))
+    for k, (i, j) in enumerate(ends):
+        rows[k, :, i, :7], rows[k, :, j, :7] = A_i[k], A_j[k]
+    return rows.reshape(6 * count, -1), b.ravel()
+
+
+def test_samples_hang_together_as_dense_algebra_has_it():
+    rng, nodes = np.random.default_rng(5), 6
+    system = ChainSystem(nodes, 1)
+    i = np.arange(nodes - 1)
+    A_i, A_j = rng.standard_normal((nodes - 1, 9, DIM)), rng.standard_normal((nodes - 1, 9, 10))
+    system.add(slice(0, nodes - 1), slice(1, nodes), (slice(0, DIM), A_i), (slice(0, 10), A_j), rng.random((5, 9)))
+    for c in range(DIM):
+        system.add_everywhere(c, 0.5)
+    dense = 0.5 * np.eye(nodes * DIM)
+    for k in i:
+        A = np.zeros((9, nodes * DIM))
+        A[:, k * DIM:(k + 1) * DIM], A[:, (k + 1) * DIM:(k + 1) * DIM + 10] = A_i[k], A_j[k]
+        dense += A.T @ A
+    rows, _ = add_far(system, 3, rng)
+    dense += rows.T @ rows
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(chain, "SAMPLES", 20_000)
+        samples = system.factor().marginals_and_samples(rng)[1]
+    drawn = samples.xi.reshape(20_000, -1)
+    poses = (np.arange(nodes)[:, None] * DIM + np.arange(1, 7)).ravel()
+    want = np.linalg.inv(dense)[np.ix_(poses, poses)]
+    sd = np.sqrt(np.diagonal(want))
+    np.testing.assert_allclose(np.cov(drawn.T) / sd / sd[:, None], want / sd / sd[:, None], atol=0.05)
 
 
 def test_what_nothing_holds_is_indeterminate():

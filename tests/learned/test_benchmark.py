@@ -1,7 +1,10 @@
 """`capsule-vio benchmark`: the plan of every table, one table end to end, resumed, and what it refuses."""
 
 import json
+import os
 import shutil
+import subprocess
+import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -124,6 +127,33 @@ def test_a_table_from_the_command_line(finished, data, capsys):
     assert main(command(data, finished, "--json")) == 0
     assert json.loads(capsys.readouterr().out) == table
     assert {path: path.stat().st_mtime_ns for path in (finished / "runs").rglob("*.json")} == before
+
+
+SHARED = """
+import sys
+from dataclasses import replace
+from fusion.cli import main
+from learned.benchmark import BUDGETS
+BUDGETS["smoke"] = replace(BUDGETS["smoke"], steps=2, test_frames=5)
+sys.exit(main(sys.argv[1:]))
+"""
+
+
+def test_two_processes_share_the_runs_and_make_the_same_table(finished, data, tmp_path):
+    script, out = tmp_path / "shared.py", tmp_path / "OUT"
+    script.write_text(SHARED)
+    torchrun = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node", "2", str(script)]
+    environment = os.environ | {"OMP_NUM_THREADS": "1", "PYTHONPATH": str(Path(__file__).parents[2])}
+    ended = subprocess.run([*torchrun, *command(data, out)], capture_output=True, text=True, env=environment,
+                           timeout=300)
+    assert ended.returncode == 0, ended.stderr[-3000:]
+    assert ended.stdout.count("vibration-types.md") == 1  # one of them speaks
+    for made in sorted((finished / "runs").rglob("*.json")):
+        assert (out / made.relative_to(finished)).read_bytes() == made.read_bytes()
+    for name in ("vibration-types.json", "vibration-types.md"):
+        assert (out / name).read_bytes() == (finished / name).read_bytes()
+    for k in range(1, 5):
+        assert ended.stderr.count(f"run {k} of 4") == 1  # nobody trained what another had taken
 
 
 def test_a_killed_table_ends_as_if_nothing_had_happened(finished, data, tmp_path):

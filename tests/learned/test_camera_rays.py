@@ -7,7 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from learned.camera_rays import camera_batch
-from learned.lie import inverse, so3_exp, so3_log, transform
+from learned.lie import halfway, inverse, so3_exp, so3_log, transform
 from vio import se3
 from vio.camera import Camera
 from vio.errors import CameraError
@@ -110,6 +110,17 @@ def test_rotations_agree_with_numpy_near_and_at_rest(direction, size):
     np.testing.assert_allclose(so3_log(R), w, atol=1e-12)
     T = transform(R, torch.from_numpy(w + 1))
     np.testing.assert_allclose(inverse(T) @ T, np.eye(4), atol=1e-14)
+
+
+@given(st.lists(st.floats(-1, 1), min_size=3, max_size=3), st.sampled_from([0.0, 1e-9, 1e-5, 1e-3, 0.1, 1.2]))
+def test_halfway_is_as_far_from_either_motion_and_keeps_equal_ones(direction, size):
+    w = torch.from_numpy(size * np.array(direction))
+    a, b = transform(so3_exp(-w), w), transform(so3_exp(0.5 * w), 3 * w + 1)
+    middle = halfway(a, b)
+    np.testing.assert_allclose(halfway(a, a), a, atol=1e-14)
+    np.testing.assert_allclose(middle, halfway(b, a), atol=1e-12)
+    np.testing.assert_allclose(so3_log(middle[:3, :3]), -0.25 * w, atol=1e-12)
+    np.testing.assert_allclose(middle[:3, 3], 2 * w + 0.5, atol=1e-14)
 
 
 @pytest.mark.parametrize("size", [0.0, 1e-8, 9e-4, 1.1e-3, 0.5, 2.5])

@@ -132,7 +132,7 @@ def test_correlation_is_that_of_the_errors(file, ball):
         true = one.pairs.T_true_m[rows]
         scale = np.array([0.02] * 3 + [0.05] * 3) * 0.1
         parts = {key: getattr(one.pairs, key)[rows] for key in ("images", "depth", "signals", "step_s")}
-        pairs = replace(one.pairs, T_true_m=true, T_i_j=true @ se3.inverse(se3.exp(b * scale)), R_gyro=None,
+        pairs = replace(one.pairs, T_true_m=true, T_i_j=true @ se3.inverse(se3.exp(b * scale)), gyro=None,
                         depth_true_m=None, **parts)
         fits = replace(one.fits, frame=np.arange(n), T_i_j=true @ se3.inverse(se3.exp(a * scale)),
                        cov=one.fits.cov[rows], points=one.fits.points[rows], middle=one.fits.middle[rows])

@@ -153,10 +153,34 @@ def test_matches_point_where_things_went_whatever_the_light():
     network = CorrelationPoseNetwork(16).eval()
     image = F.interpolate(torch.rand(1, 3, 24, 24), (96, 96), mode="bicubic").clamp(0, 1)
     moved = 0.7 * torch.roll(image, (8, -4), (2, 3)) + 0.1  # two cells down, one left, in other light
-    matches = network.matches(network.features(image), network.features(moved))[0, :81]
+    seen = (locally_normalised(network.features(each)) for each in (image, moved))
+    matches = network.matches(*seen)[0, :81]
     dy, dx = matches[:, 8:16, 8:16].argmax(0) // 9 - 4, matches[:, 8:16, 8:16].argmax(0) % 9 - 4
     assert (dy == 2).float().mean() > 0.9 and (dx == -1).float().mean() > 0.9
     torch.testing.assert_close(matches.sum(0), torch.full((24, 24), 4.0))
+
+
+def test_coarser_maps_find_what_moves_out_of_the_finest_ones_reach():
+    network = CorrelationPoseNetwork(16, maps=3).eval()
+    image = F.interpolate(torch.rand(1, 3, 16, 16), (128, 128), mode="bicubic").clamp(0, 1)
+    moved = torch.roll(image, (24, -16), (2, 3))  # six cells of 4 px down, out of reach; three of 8 px, two left
+    told = []
+    network.coarser[0].register_forward_hook(lambda module, inputs, output: told.append(inputs[0]))
+    network.coarser_matches(network.features(image), network.features(moved))
+    best = told[0][0, :, 4:12, 4:12].argmax(0)
+    assert (best // 9 - 4 == 3).float().mean() > 0.9 and (best % 9 - 4 == -2).float().mean() > 0.9
+
+
+def test_coarser_maps_say_nothing_before_they_have_learned():
+    plain, reaching = CorrelationPoseNetwork(16).eval(), CorrelationPoseNetwork(16, maps=3).eval()
+    missing = reaching.load_state_dict(plain.state_dict(), strict=False)
+    assert missing.missing_keys == [f"coarser.{k}.{part}" for k in (0, 1) for part in ("weight", "bias")]
+    frames = torch.rand(1, 2, 3, 72, 104)
+    torch.testing.assert_close(plain(frames, [(0, 1)], None).raw, reaching(frames, [(0, 1)], None).raw)
+    reaching(frames, [(0, 1)], None).raw.sum().backward()
+    assert all(layer.weight.grad.abs().max() > 0 for layer in reaching.coarser)
+    with pytest.raises(ConfigError, match="4 correlation maps"):
+        CorrelationPoseNetwork(16, maps=4)
 
 
 def test_normalised_features_are_finite_on_a_blank_map():

@@ -168,17 +168,21 @@ def test_a_fault_midway_leaves_nothing(recording: Recording, tmp_path: Path) -> 
     assert list(out.iterdir()) == []
 
 
-def test_a_damaged_frame_loses_its_motions_and_nothing_stands_in_for_it(recording: Recording, tmp_path: Path) -> None:
+@pytest.mark.parametrize(("damage", "says"), [
+    (lambda path: path.write_bytes(path.read_bytes()[:path.stat().st_size // 2]), "06.png is cut off"),
+    (Path.unlink, "06.png cannot be read"),
+])
+def test_a_damaged_frame_loses_its_motions_and_nothing_stands_in_for_it(recording: Recording, tmp_path: Path, damage,
+                                                                        says) -> None:
     whole = learned.predict(recording, BarShift(baselines=(1, 2)), depth_dir=tmp_path / "whole")
-    content = recording.frame_paths[6].read_bytes()
-    recording.frame_paths[6].write_bytes(content[: len(content) // 2])
+    damage(recording.frame_paths[6])
     motions = learned.predict(recording, BarShift(baselines=(1, 2)), depth_dir=tmp_path / "depth")
     t = recording.frame_t_s
     kept = (whole.t_i_s != t[6]) & (whole.t_j_s != t[6])
     np.testing.assert_array_equal(motions.t_i_s, whole.t_i_s[kept])
     np.testing.assert_array_equal(motions.T_i_j, whole.T_i_j[kept])
     assert list(motions.meta["unreadable_frames"]) == ["6"]
-    assert "06.png is cut off" in motions.meta["unreadable_frames"]["6"]
+    assert says in motions.meta["unreadable_frames"]["6"]
     for k, (ours, theirs) in enumerate(zip(motions.depth, whole.depth, strict=True)):
         image = cv2.imread(str(ours), cv2.IMREAD_UNCHANGED)
         assert ours.name == theirs.name and image.shape == (HEIGHT, WIDTH)
@@ -270,8 +274,8 @@ def test_weights_that_are_not_there_are_named(recording: Recording, weights: str
     with pytest.raises(learned.WeightsError, match=f"weights {Path(weights).name}: No such file") as caught:
         learned.predict(recording, weights)
     assert "somewhere" not in str(caught.value) and caught.value.exit_code == 3
-    with pytest.raises(ConfigError, match="only weights calibrated with an IMU"):
-        learned.predict(recording, BarShift(), rotation="gyro")
+    with pytest.raises(ConfigError, match="rotation 'imu' is unknown"):
+        learned.predict(recording, BarShift(), rotation="imu")
 
 
 def test_unusable_input_is_refused(recording: Recording) -> None:

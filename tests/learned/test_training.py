@@ -16,9 +16,10 @@ import torch
 from learned.averaging import WeightAverage
 from learned.checkpoints import load_checkpoint, save_checkpoint
 from learned.dataset import TripletDataset, collate
-from learned.errors import CheckpointError, NetworkInputError, TrainingError
+from learned.errors import CheckpointError, NetworkInputError, TrainingError, WeightsError
+from learned.lie import inverse, so3_exp, transform
 from learned.methods import method_config
-from learned.objective import Objective
+from learned.objective import Objective, tied
 from learned.train_config import (
     BOOKKEEPING,
     TrainConfig,
@@ -195,6 +196,26 @@ def test_the_gyros_rotation_warps_and_teaches(ball):
             objective(dataclasses.replace(batch, R_i_j_gyro=None), 0)
 
 
+def test_one_motion_a_pair_holds_the_scale_of_both_directions(ball):
+    turn = so3_exp(torch.tensor([[0.1, -0.2, 0.05]]))
+    there, back = (transform(turn, length * torch.tensor([[1.0, 2.0, -1.0]])) for length in (1.0, 1.6))
+    one = tied({(0, 1): there, (1, 0): inverse(back)})
+    torch.testing.assert_close(one[0, 1], transform(turn, 1.3 * torch.tensor([[1.0, 2.0, -1.0]])))
+    torch.testing.assert_close(one[0, 1] @ one[1, 0], torch.eye(4)[None])
+    torch.testing.assert_close(tied(one)[1, 0], one[1, 0])
+
+    batch = collate([TripletDataset([ball], source_settings(tiny()), "train", augment=False)[2]])
+    method = Trainer([ball], tiny(), Path("unused")).method.eval()
+    losses = []
+    for ties in (True, False):
+        method.zero_grad()
+        loss = Objective(method, tiny(tied_motions=ties)).eval()(batch)[0]
+        loss.backward()
+        losses.append(loss.item())
+        assert all(p.grad.isfinite().all() for p in method.parameters() if p.grad is not None)
+    assert losses[0] != losses[1]
+
+
 def test_validation_leaves_the_run_as_it_was(ball, tmp_path):
     often, never = (train([ball], tiny(steps=4, validate_every=every), tmp_path / str(every)).method.state_dict()
                     for every in (1, 100))
@@ -206,6 +227,10 @@ def test_frozen_batch_norms_train_as_they_are_used(ball, tmp_path):
     config = tiny(freeze_batch_norm=True, dropout=0.0, light_start_steps=0, ema_decay=0.0)
     trainer = Trainer([ball], config, tmp_path, start_from=warm)
     assert all(torch.equal(value, warm[name]) for name, value in trainer.method.state_dict().items())
+    for start, says in (({"a": torch.zeros(1)}, "they lack"), (warm | {"a": torch.zeros(1)}, "unknown a"),
+                        ({name: value[..., None] for name, value in warm.items()}, "another shape")):
+        with pytest.raises(WeightsError, match=f"^start weights: .*{says}"):
+            Trainer([ball], config, tmp_path, start_from=start)
     batch = next(trainer._batches())
     with torch.no_grad():
         training, use = trainer.objective(batch, 0)[0], trainer.objective.eval()(batch, 0)[0]

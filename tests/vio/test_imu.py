@@ -35,7 +35,8 @@ def cut_problems(draw):
 
 @given(cut_problems(), st.lists(st.floats(-3, 3), min_size=12, max_size=12))
 def test_signals_that_change_steadily_are_cut_exactly(problem, coefficients):
-    # Whatever the stamps and the cuts: rates a + b t integrate exactly, forces are turned from piece centre to start.
+    # Whatever the stamps and the cuts: rates a + b t integrate exactly, forces are turned from piece centre to start,
+    # and forces alone integrate exactly twice.
     samples, t, frames = problem
     a, b, c, d = np.reshape(coefficients, (4, 3))
     samples = replace(samples, gyro_rad_s=a + b * t[:, None], accel_m_s2=c + d * t[:, None])
@@ -43,10 +44,17 @@ def test_signals_that_change_steadily_are_cut_exactly(problem, coefficients):
     assert pieces.first[0] == 0 and pieces.first[-1] == len(pieces.dt_s) and (pieces.dt_s > 0).all()
     centre = frames[0] + np.cumsum(pieces.dt_s) - 0.5 * pieces.dt_s
     half_turn = se3.so3_exp((a + b * centre[:, None]) * 0.5 * pieces.dt_s[:, None])
-    np.testing.assert_allclose(pieces.accel_m_s2, (half_turn @ (c + d * centre[:, None])[..., None])[..., 0], atol=1e-6)
+    turned_force = (half_turn @ (c + d * centre[:, None])[..., None])[..., 0]
+    still = split_at_frames(replace(samples, gyro_rad_s=np.zeros_like(samples.gyro_rad_s)), t, frames)
     for k in range(len(frames) - 1):
         part, (lo, hi) = slice(pieces.first[k], pieces.first[k + 1]), frames[k:k + 2]
-        np.testing.assert_allclose(pieces.dt_s[part].sum(), hi - lo, rtol=1e-12)
+        h = pieces.dt_s[part]
+        np.testing.assert_allclose(h.sum(), hi - lo, rtol=1e-12)
+        np.testing.assert_allclose(h @ pieces.accel_m_s2[part], h @ turned_force[part], atol=1e-6)
+        arm = hi - centre[part]
+        if h @ (arm - (hi - lo) / 2) ** 2 > 0.021 * (hi - lo) ** 3:
+            exact = c * (hi - lo) ** 2 / 2 + d * ((hi - lo) ** 3 / 6 + lo * (hi - lo) ** 2 / 2)
+            np.testing.assert_allclose((h * arm) @ still.accel_m_s2[part], exact, atol=1e-6)
         turned = pieces.dt_s[part] @ pieces.gyro_rad_s[part]
         np.testing.assert_allclose(turned, a * (hi - lo) + b * (hi**2 - lo**2) / 2, atol=1e-7)
 

@@ -39,7 +39,7 @@ def test_unit_and_correlation_are_measured_and_the_mean_is_claimed_honestly(shar
                for own, unit in ((own_a, 0.8), (own_b, 0.8 * unit_m))]
     merged = merge_motions(sources)
     assert merged.log_ratio[1] == pytest.approx(np.log(unit_m), abs=0.01)
-    assert merged.correlation[0, 1] == pytest.approx(share, abs=0.08)
+    np.testing.assert_allclose(merged.correlation[0, 1], share, atol=0.08)
     metric = merged.motions.T_i_j.copy()
     metric[:, :3, 3] *= 0.8
     a, b = (metric[merged.source == k] for k in (0, 1))
@@ -52,8 +52,24 @@ def test_unit_and_correlation_are_measured_and_the_mean_is_claimed_honestly(shar
 def test_a_source_given_twice_counts_once():
     once = source(truth(300), np.random.default_rng(2).standard_normal((300, 6)) * SD, 0.8)
     merged = merge_motions([once, once])
-    assert merged.correlation[0, 1] == 1.0 and len(merged.motions) == 600
+    assert (merged.correlation[0, 1] == 1.0).all() and len(merged.motions) == 600
     np.testing.assert_allclose(merged.motions.cov[::2], 2 * once.cov, rtol=1e-12)
+
+
+def test_a_correlation_that_was_measured_beside_truth_is_taken_for_its_own_weights_alone():
+    rng = np.random.default_rng(4)
+    a, b = (source(truth(300), rng.standard_normal((300, 6)) * SD, 0.8) for _ in range(2))
+    network = replace(a, meta={"rotation": "network", "predictor": {"sha256": "1f"}})
+    known = {"source": "learned", "predictor": {"sha256": "1f"},
+             "network_correlation": {"rotation": 0.2, "translation": 0.5}}
+    for sources in ([network, replace(b, meta=known)], [replace(b, meta=known), network]):
+        merged = merge_motions(sources)
+        np.testing.assert_allclose(merged.correlation[0, 1], [0.2, 0.5])
+        np.testing.assert_allclose(np.diagonal(merged.motions.cov[0]),
+                                   np.repeat([1.2, 1.5], 3) * np.diagonal(sources[0].cov[0]), rtol=0.05)
+    turned = replace(a, meta=network.meta | {"rotation": "gyro"})  # other rotations, other errors
+    for one, other in ((network, known | {"predictor": {"sha256": "2e"}}), (network, {}), (turned, known)):
+        assert (merge_motions([one, replace(b, meta=other)]).correlation[0, 1] < 0.15).all()
 
 
 def test_one_source_stays_as_it_is():
@@ -67,7 +83,7 @@ def test_wider_baselines_and_disjoint_pairs_are_left_alone():
     near = source(truth(60), np.zeros((60, 6)), 0.8)
     wide = replace(near, t_i_s=near.t_i_s[:-2], t_j_s=near.t_j_s[2:], T_i_j=near.T_i_j[:-2], cov=near.cov[:-2])
     merged = merge_motions([near, wide])
-    assert merged.correlation[0, 1] == 0 and (merged.motions.t_i_s[1:] >= merged.motions.t_i_s[:-1]).all()
+    assert (merged.correlation[0, 1] == 0).all() and (merged.motions.t_i_s[1:] >= merged.motions.t_i_s[:-1]).all()
     np.testing.assert_allclose(np.sort(merged.motions.cov[:, 0, 0]), SD[0] ** 2, rtol=1e-12)
 
 

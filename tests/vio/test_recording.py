@@ -98,14 +98,14 @@ def test_a_jpeg_that_is_cut_off_is_refused(recording, tmp_path: Path):
 
 def test_images_that_are_missing_or_of_another_size(recording):
     recording.frame_paths[4].unlink()
-    assert not recording.has_images
+    assert not recording.has_images and recording.has_any_image
     with pytest.raises(RecordingError, match=r"^frame 4: images/4\.png cannot be read"):
         recording.frame(4)
     cv2.imwrite(str(recording.frame_paths[5]), np.zeros((24, 30, 3), np.uint8))
     with pytest.raises(RecordingError, match=r"^frame 5 .*30 x 24 pixels but the camera 32 x 24"):
         recording.frame(5)
     bare = replace(recording, frame_paths=(), depth_paths=())
-    assert not bare.has_images and bare.depth_m(0) is None
+    assert not bare.has_images and not bare.has_any_image and bare.depth_m(0) is None
     with pytest.raises(RecordingError, match=r"frame 0: .*no images"):
         bare.frame(0)
 

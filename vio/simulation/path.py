@@ -6,7 +6,9 @@ Times are seconds after the first frame. Driving is
 * "transit": as slow as a capsule really is, most of the way in bursts that take a few percent of the time;
 * "natural": about ten times that, so that short sequences contain parallax; dwells, bursts, to and fro;
 * "operated": an operator drives it through, mostly forward (how the paper's data were made);
-* "brisk": another operator, faster, with more looking back.
+* "brisk": another operator, faster, with more looking back;
+* "one-way": forward only, never back, unless it comes to the organ's end;
+* "withdrawn": as operated until half the time has passed, then pulled back the way it came, still looking ahead.
 
 At a closed end of the organ the capsule turns back: every organ has the length it has, and a long course revisits.
 """
@@ -38,9 +40,11 @@ _PHASES = {
                  "burst": (0.05, 6.0, 20.0), "revisit": (0.05, -3.0, -8.0)},
     "brisk": {"forward": (0.55, 4.0, 12.0), "back": (0.20, -3.0, -9.0), "dwell": (0.05, 0.0, 0.0),
               "burst": (0.10, 8.0, 24.0), "revisit": (0.10, -4.0, -10.0)},
+    "one-way": {"forward": (0.90, 2.0, 8.0), "dwell": (0.05, 0.0, 0.0), "burst": (0.05, 6.0, 20.0)},
     "transit": {"forward": (0.18, 0.1, 0.5), "back": (0.06, -0.1, -0.4), "dwell": (0.72, 0.0, 0.0),
                 "burst": (0.035, 4.0, 12.0), "revisit": (0.005, -2.0, -5.0)},
 }
+_PHASES["withdrawn"] = _PHASES["operated"]
 DRIVING = tuple(_PHASES)
 _HEADING_WANDER_RAD = (0.20, 0.06, 0.06)  # about body x (roll), y and z, standard deviations
 _PLACE_SD = 0.9  # of the place across the lumen, in units of the room that the capsule has
@@ -94,7 +98,8 @@ def moving_path(anatomy: Anatomy, driving: str, duration_s: float, rng: np.rando
     factor = organ.transit_factor if driving == "transit" else organ.speed_factor
     low, high = 0.4 * organ.radius_m + END_GAP_M, organ.length_m - 0.4 * organ.radius_m - END_GAP_M
     t = np.arange(-MARGIN_S, duration_s + MARGIN_S + KNOT_SPACING_S, KNOT_SPACING_S)
-    arc = _course(t, _PHASES[driving], factor, low + place * (high - low), (low, high), rng)
+    turn_s = 0.5 * duration_s if driving == "withdrawn" else np.inf
+    arc = _course(t, _PHASES[driving], factor, low + place * (high - low), (low, high), turn_s, rng)
     along = anatomy.centreline.frame(arc)
     positions = _chord_middle(anatomy, arc) + along.apply(_place_across(anatomy, arc, rng))
     wander = Rotation.from_rotvec(_smooth_noise(rng, len(t), 9) * _HEADING_WANDER_RAD)
@@ -111,8 +116,11 @@ def resting_path(anatomy: Anatomy, duration_s: float, rng: np.random.Generator) 
 
 
 def _course(t: Array, phases: dict[str, tuple[float, float, float]], factor: float, start_m: float,
-            ends_m: tuple[float, float], rng: np.random.Generator) -> Array:
-    """Arc length (n,) [m] at times t: phases of 1.5 to 5 s at constant speed, rounded off; it turns at the ends."""
+            ends_m: tuple[float, float], turn_s: float, rng: np.random.Generator) -> Array:
+    """Arc length (n,) [m] at times t: phases of 1.5 to 5 s at constant speed, rounded off.
+
+    It turns at the ends, and with the first phase that begins after `turn_s`.
+    """
     table = np.array(list(phases.values()))
     count = int(np.ceil((t[-1] - t[0]) / 1.5)) + 2
     kind = rng.choice(len(table), count, p=table[:, 0])
@@ -120,11 +128,15 @@ def _course(t: Array, phases: dict[str, tuple[float, float, float]], factor: flo
     length = rng.uniform(1.5, 5.0, count)
     arc, sense = np.empty(count + 1), 1.0
     arc[0] = start_m
+    begin = t[0] + np.concatenate([[0.0], np.cumsum(length)])
+    turning = int(np.searchsorted(begin, turn_s))
     for k, step in enumerate(speed * length):
+        if k == turning:
+            sense = -sense
         arc[k + 1] = min(max(arc[k] + sense * step, ends_m[0]), ends_m[1])
         if arc[k + 1] in ends_m:
             sense = 1.0 if arc[k + 1] == ends_m[0] else -1.0
-    out: Array = PchipInterpolator(t[0] + np.concatenate([[0.0], np.cumsum(length)]), arc)(t)
+    out: Array = PchipInterpolator(begin, arc)(t)
     return out
 
 

@@ -105,7 +105,7 @@ def simulate(
         seed: integer ≥ 0.
         frame_rate_hz: frames per second.
         noise: IMU noise, rate and full scales.
-        driving: "natural", "operated", "brisk" or "transit", see `vio.simulation.path`.
+        driving: "natural", "operated", "brisk", "one-way", "withdrawn" or "transit", see `vio.simulation.path`.
         mode: "moving", or "rest" for a capsule that lies still (the vibration still shakes it).
         start: where in the organ it starts, 0 its entrance, 1 its exit; None = drawn from the first 60 %.
         wall_motion: scale of the wall's contractions, 1 as in life, 0 none.
