@@ -12,7 +12,7 @@ import pytest
 from benchmarks.simulated_lesions import SimulatedLesion
 from fusion import Provenance, Sighting, locate, write_lesions, write_run
 from fusion.config import RefineConfig
-from fusion.lesions.fixes import PIXEL_SD, DepthSource, place_sighting, pose_and_scale_covariance
+from fusion.lesions.fixes import PIXEL_SD, DepthSource, Fix, place_sighting, pose_and_scale_covariance
 from fusion.lesions.merging import merge
 from fusion.lesions.table import COLUMNS
 from vio import se3
@@ -86,6 +86,14 @@ def test_sd_maps_beside_predicted_depth_are_believed(case, tmp_path):
         read_depth_folder(folder, case.recording)
 
 
+def answer(fixes: list[Fix], scales: np.ndarray, t_s: np.ndarray) -> np.ndarray:
+    """How a merged place moves per unit when its depth maps are off by such shares of their sd."""
+    small = 1e-4
+    shifted = [replace(f, point_m=f.point_m + small * e * f.image_m) for f, e in zip(fixes, scales, strict=True)]
+    (before,), (after,) = merge(fixes, t_s), merge(shifted, t_s)
+    return (after.point_m - before.point_m) / small
+
+
 @pytest.mark.parametrize(("said", "sd"), [({"image_log_sd": 0.4, "common_log_sd": 0.5}, 0.4),
                                           ({"common_log_sd": 0.5}, 0.5), ("never calibrated", 0.0)])
 def test_neighbouring_maps_are_off_by_one_scale_that_no_merging_averages(case, tmp_path, said, sd):
@@ -103,8 +111,12 @@ def test_neighbouring_maps_are_off_by_one_scale_that_no_merging_averages(case, t
         (place,) = merge(fixes, t_s)
         added = place.own_cov - place.pixel_cov
         assert np.linalg.eigvalsh(added).min() > -1e-12
-        away = [np.linalg.norm(f.point_m - eye) for f, eye in zip(fixes, eyes, strict=True)]
-        assert 0.7 * (sd * min(away)) ** 2 <= np.trace(added) <= (sd * max(away)) ** 2
+        # Oracle: move the fixes as scales that hang together in time would, and see what becomes of their mean.
+        apart = 3**0.5 * np.abs(np.subtract.outer(t_s[[f.index for f in fixes]], t_s[[f.index for f in fixes]])) / 2
+        moved = np.array([answer(fixes, column, t_s) for column in np.linalg.cholesky((1 + apart) * np.exp(-apart)).T])
+        np.testing.assert_allclose(added, moved.T @ moved, rtol=1e-4, atol=1e-12)
+        shared = answer(fixes, np.ones(len(fixes)), t_s)
+        assert np.trace(added) >= 0.85 * shared @ shared
         # A minute later the maps are off by another scale, and the mean of both is surer.
         late = [replace(f, index=f.index + 180) for f in fixes if f.index + 180 < len(t_s)]
         if len(late) == len(fixes):
