@@ -38,16 +38,16 @@ class GyroCorrelationConfig(MethodConfig):
     """Of the depth ResNet, at half the published width (`width` 2 is the published one)."""
     radius: int = 4
     """Cells that a match may lie away."""
-    correlation_maps: int = 1
+    correlation_maps: int = 3
     """Of a quarter, an eighth and a sixteenth of the image's resolution: reach 16, 32 and 64 px at radius 4."""
     image_size: tuple[int, int] = (128, 128)
     """Measured to train well; larger for finer detail."""
-    whole_image: bool = False
+    whole_image: bool = True
     """One number per image, of the encoder's mean features, says how near everything is."""
     depth_range: DepthRange = field(default_factory=lambda: DepthRange(0.1, 4.0))
     """Units of 20 mm."""
     pose: PoseParametrisation = field(
-        default_factory=lambda: PoseParametrisation("vector", "rotation_first", 0.01, "i_then_j"))
+        default_factory=lambda: PoseParametrisation("vector", "rotation_first", 0.01, "i_then_j", in_depths=True))
     """Features of camera i are correlated with those of j, so the motion is told in camera i's axes. At a scale of 0.1
     one step of Adam at 1e-3 may move the sum over 4096 weights of the head by more than a motion."""
     depth_frames: tuple[int, ...] = (0, 1, 2)
