@@ -16,7 +16,8 @@ from benchmarks.browser import Browser
 from fusion import Provenance, RefineConfig, locate, read_refinement, read_run, write_lesions, write_run
 from fusion.cli import main
 from fusion.report import write_report
-from fusion.report.levels import spans_speed
+from fusion.report.kept import even_frames
+from fusion.report.levels import SPANS, spans_speed
 from fusion.report.pictures import MOST, picture_gallery
 from fusion.report.tube import RADIUS_SD, SIDES, ring_frames, tube
 from fusion.view import write_rerun
@@ -61,11 +62,11 @@ def test_rests_take_no_rings_and_a_still_track_has_two():
 def test_speed_times_time_is_the_way(n, dt_s):
     p = np.cumsum(np.random.default_rng(n).normal(size=(n, 3)), axis=0)
     t = np.arange(n) * dt_s
-    centres, speed = spans_speed(t, p)
-    assert len(centres) <= 1000 and (np.diff(centres) > 0).all()
-    way = np.linalg.norm(np.diff(p, axis=0), axis=1).sum()
-    edges = np.unique(np.linspace(0, n - 1, min(1001, n)).round().astype(int))
-    assert speed @ np.diff(t[edges]) == pytest.approx(way)
+    way = np.concatenate([[0.0], np.linalg.norm(np.diff(p, axis=0), axis=1).cumsum()])
+    edges = even_frames(n, SPANS + 1)
+    centres, speed = spans_speed(t[edges], way[edges])
+    assert len(centres) <= SPANS and (np.diff(centres) > 0).all()
+    assert len(speed) == 1 == n or speed @ np.diff(t[edges]) == pytest.approx(way[-1])
 
 
 # ---- pictures ---------------------------------------------------------------------------------
