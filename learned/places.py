@@ -87,9 +87,10 @@ def _local_features(recording: Recording, predictor: NetworkPredictor, index: ND
 
 def local_features(method: Method, frames: Tensor) -> Tensor:
     """Unit features (B, C, h, w) of frames (B, 3, H, W) in 0..1, without vibration."""
-    if isinstance(method.pose, CorrelationPoseNetwork):
-        return method.pose.features(frames)
-    return locally_normalised(method.depth.encoder(frames)[ENCODER_BLOCK])
+    pose = method.pose
+    maps = pose.features(frames) if isinstance(pose, CorrelationPoseNetwork) else \
+        method.depth.encoder(frames)[ENCODER_BLOCK]
+    return locally_normalised(maps)
 
 
 def learn_words(cells: Array32, count: int, rng: np.random.Generator) -> Array32:
