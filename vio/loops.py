@@ -9,7 +9,6 @@ import json
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -43,14 +42,9 @@ class Loops:
 
     def save(self, path: str | Path) -> None:
         """Write `loops.npz` atomically."""
-        m = self.motions
-        arrays: dict[str, Any] = {"proposed": np.int64(self.proposed),
-                                  "refused": np.array(json.dumps(dict(self.refused), sort_keys=True)),
-                                  "found": np.int64(len(self))}
-        if m is not None:
-            arrays |= {"t_i": m.t_i_s, "t_j": m.t_j_s, "T_i_j": m.T_i_j, "cov": m.cov,
-                       "scale_log_mean": np.float64(m.scale_log_mean), "scale_log_sd": np.float64(m.scale_log_sd),
-                       "meta": np.array(json.dumps(m.meta, sort_keys=True))}
+        arrays = {} if self.motions is None else self.motions.arrays()
+        arrays |= {"proposed": np.int64(self.proposed), "found": np.int64(len(self)),
+                   "refused": np.array(json.dumps(dict(self.refused), sort_keys=True))}
         with atomic_write(path) as file:
             np.savez_compressed(file, **arrays)
 

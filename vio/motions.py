@@ -87,8 +87,8 @@ class RelativeMotions:
     def __len__(self) -> int:
         return len(self.t_i_s)
 
-    def save(self, path: str | Path) -> None:
-        """Write `motions.npz` atomically."""
+    def arrays(self) -> dict[str, Any]:
+        """What the file holds, by key."""
         arrays: dict[str, Any] = {
             "t_i": self.t_i_s, "t_j": self.t_j_s, "T_i_j": self.T_i_j, "cov": self.cov,
             "scale_log_mean": np.float64(self.scale_log_mean), "scale_log_sd": np.float64(self.scale_log_sd),
@@ -96,8 +96,12 @@ class RelativeMotions:
         }
         if self.snr is not None:
             arrays["snr"] = self.snr
+        return arrays
+
+    def save(self, path: str | Path) -> None:
+        """Write `motions.npz` atomically."""
         with atomic_write(path) as file:
-            np.savez_compressed(file, **arrays)
+            np.savez_compressed(file, **self.arrays())
 
 
 def load_motions(path: str | Path) -> RelativeMotions:

@@ -4,10 +4,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import torch
 
 import learned
 from learned.loops import _Chain, _Loop, _thinned, trace_loops
-from learned.places import Places, aggregate, learn_words, look_alikes
+from learned.methods import build_method
+from learned.places import Places, aggregate, learn_words, local_features, look_alikes
 from vio import se3
 from vio.errors import RecordingError
 from vio.formats.asl import read_asl
@@ -110,3 +112,11 @@ def test_loops_support_each_other_only_where_they_tell_of_one_motion():
     assert support == {(2, 36): 2, (3, 35): 2, (5, 34): 2, (4, 33): 0}
     assert set(_thinned(found, 1)) == {(2, 36), (5, 34)} or len(_thinned(found, 1)) == 2
     assert len(_thinned(found, 0)) == 4
+
+
+@pytest.mark.parametrize("name", ["gyro-correlation", "endosfmlearner"])
+def test_cells_are_described_by_unit_features_free_of_the_lights_gain(name):
+    method = build_method(name, width=0.25, image_size=(64, 64), seed=3).eval()
+    with torch.no_grad():
+        maps = local_features(method, torch.rand(2, 3, 64, 64))
+    torch.testing.assert_close(maps.norm(dim=1), torch.ones(2, *maps.shape[2:]))
