@@ -16,14 +16,16 @@ if TYPE_CHECKING:
 
 def train(arguments: argparse.Namespace) -> int:
     """Train, and calibrate what was trained."""
+    from fusion.teaching import teaching_trajectories
     from learned.distributed import leads
     from learned.train_command import run_training
     from vio.formats import open_recording
 
     recordings, others = ([open_recording(path) for path in paths]
                           for paths in (arguments.recordings, arguments.calibrate))
+    taught_by = None if arguments.refined is None else teaching_trajectories(recordings, arguments.refined)
     with Progress() as progress:
-        trained = run_training(recordings, others, vars(arguments), progress.count)
+        trained = run_training(recordings, others, vars(arguments), progress.count, taught_by)
     if leads():
         print(trained)
     return 0

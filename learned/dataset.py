@@ -30,6 +30,7 @@ from learned.truth import Truth, truth_of
 from vio.camera import Camera
 from vio.errors import ConfigError, RecordingError
 from vio.recording import Recording
+from vio.trajectory import Trajectory
 
 Split = Literal["train", "validation", "all"]
 TRAIN_SHARE = 0.8
@@ -51,6 +52,9 @@ class Triplet:
     """(2, 3, 3) float32 integrated gyro from each frame to the next, camera axes."""
     step_s: Tensor
     """(2,) float32 seconds between the frames."""
+    step_m: Tensor
+    """(2,) float32 how far the camera moved between the frames according to a refined trajectory, NaN where no
+    trajectory says."""
     recording: int
     """Number of the recording."""
     index: tuple[int, int, int]
@@ -73,6 +77,8 @@ class TripletBatch:
     """(B, 2, 3, 3) float32."""
     step_s: Tensor
     """(B, 2) float32."""
+    step_m: Tensor
+    """(B, 2) float32, NaN where no trajectory says."""
     recording: Tensor
     """(B,) int64."""
     index: Tensor
@@ -94,7 +100,7 @@ class TripletBatch:
             self, frames=move(self.frames), usable=move(self.usable), cameras=self.cameras.to(device),
             vibration=None if self.vibration is None else move(self.vibration),
             R_i_j_gyro=None if self.R_i_j_gyro is None else move(self.R_i_j_gyro),
-            step_s=move(self.step_s), recording=move(self.recording), index=move(self.index))
+            step_s=move(self.step_s), step_m=move(self.step_m), recording=move(self.recording), index=move(self.index))
 
     def pin_memory(self) -> TripletBatch:
         """The same batch in page-locked memory; called by torch's loader when it is asked to pin."""
@@ -112,7 +118,8 @@ def collate(items: Sequence[Triplet]) -> TripletBatch:
         torch.stack([item.frames for item in items]), torch.stack([item.usable for item in items]),
         camera_batch([item.camera for item in items]),
         torch.stack(vibration) if vibration else None, torch.stack(rotations) if rotations else None,
-        torch.stack([item.step_s for item in items]), torch.tensor([item.recording for item in items]),
+        torch.stack([item.step_s for item in items]), torch.stack([item.step_m for item in items]),
+        torch.tensor([item.recording for item in items]),
         torch.tensor([item.index for item in items]))
 
 
@@ -129,18 +136,26 @@ class TripletDataset(Dataset[Triplet]):
         seed: of the augmentation.
         augment: show each item as one of its eight mirror images and quarter turns, drawn anew in every epoch;
             four where width and height differ. Images, intrinsics and inertial samples change together.
+        trajectories: refined, of the body, one for each recording or None for it; None = none for any.
 
     Raises:
         RecordingError: a recording that cannot be trained on, or no triplet in all of them.
         ImuError: the IMU is absent or does not cover the frames.
+        TrajectoryError: a trajectory of another time.
     """
 
     def __init__(self, recordings: Sequence[Recording], settings: SourceSettings | None = None,
-                 split: Split = "train", seed: int = 0, augment: bool = True) -> None:
+                 split: Split = "train", seed: int = 0, augment: bool = True,
+                 trajectories: Sequence[Trajectory | None] | None = None) -> None:
         if split not in get_args(Split):
             raise ConfigError(f"training data: split {split!r} is unknown; use one of {', '.join(get_args(Split))}")
         self.settings, self.seed, self.augment = settings or SourceSettings(), seed, augment
-        self.sources = [TrainingSource(recording, self.settings) for recording in recordings]
+        if trajectories is not None and len(trajectories) != len(recordings):
+            raise ConfigError(f"training data: {len(trajectories)} trajectories for {len(recordings)} recordings; give "
+                              "one for each, None where there is none")
+        paths = trajectories or [None] * len(recordings)
+        self.sources = [TrainingSource(recording, self.settings, path)
+                        for recording, path in zip(recordings, paths, strict=True)]
         self.left_out: Counter[str] = Counter()
         rows = []
         for number, source in enumerate(self.sources):
@@ -171,10 +186,12 @@ class TripletDataset(Dataset[Triplet]):
             windows = change.imu(source.vibration(index), source.R_body_camera)
             vibration = torch.from_numpy(windows).float().transpose(1, 2).contiguous()
             rotations = torch.from_numpy(change.rotation(source.rotations(index))).float()
+        lengths = source.lengths(index)
+        step_m = torch.full((2,), torch.nan) if lengths is None else torch.from_numpy(lengths).float()
         return Triplet(
             change.image(source.frames(index)).contiguous(), change.image(source.usable).contiguous(),
             change.camera(source.camera), vibration, rotations,
-            torch.from_numpy(np.diff(source.recording.frame_t_s[index])).float(), int(self._rows[number, 0]),
+            torch.from_numpy(np.diff(source.recording.frame_t_s[index])).float(), step_m, int(self._rows[number, 0]),
             (int(index[0]), int(index[1]), int(index[2])))
 
     def windows(self, number: int) -> Tensor:

@@ -30,9 +30,11 @@ from learned.losses.masks import visible_from
 from learned.losses.priors import depth_like_light, rotation_from_gyro
 from learned.losses.resolution_adaptive import ResolutionAdaptive, resolution_adaptive_loss, scale_views
 from learned.losses.snippet import Snippet, both_directions
+from learned.losses.step_lengths import depth_from_steps
 from learned.losses.terms import LossTerms
 from learned.methods import Method, MethodOutput, snr_summary
 from learned.train_config import TrainConfig
+from vio.errors import ConfigError
 
 TARGET, SOURCES = 1, (0, 2)
 FRAMES = (0, 1, 2)
@@ -54,6 +56,9 @@ class Objective(nn.Module):
         self.with_flows = native and method.optical_flow is not None
         self.stages: tuple[str, ...] = ("flow", "motion") if self.with_flows else ("motion",)
         """Losses of one training step, in order; their weights are disjoint."""
+        if config.step_length_weight and self._motion_loss() != self._consistency:
+            raise ConfigError(f"training: step_length_weight does not go with the loss of {config.method.name}; take "
+                              "loss='paper' or leave it 0")
 
     def train(self, mode: bool = True) -> Objective:
         """Train or eval mode; frozen batch norms stay in eval mode."""
@@ -114,6 +119,9 @@ class Objective(nn.Module):
         terms = consistency_loss(snippet, self._consistency_settings(batch))
         parts = dict(terms.parts) | _snr(out) | {"gyro_rotation": rotation.detach(), "step_length": _length(motions)}
         total = terms.total + self.config.rotation_weight * rotation
+        if self.config.step_length_weight:
+            taught = _taught_by_steps(motions, depth, batch)
+            total, parts["step_lengths"] = total + self.config.step_length_weight * taught, taught.detach()
         share = 1 - step / self.config.light_start_steps if self.config.light_start_steps else 0.0
         if share > 0 and self.training:
             light = depth_like_light(depth.flatten(0, 1), batch.images.flatten(0, 1))
@@ -210,6 +218,13 @@ def gyro_rotation(batch: TripletBatch, pair: tuple[int, int]) -> Tensor:
     assert batch.R_i_j_gyro is not None
     forward = batch.R_i_j_gyro[:, min(pair)]
     return forward if pair[0] < pair[1] else forward.transpose(1, 2)
+
+
+def _taught_by_steps(motions: dict[tuple[int, int], Tensor], depth: Tensor, batch: TripletBatch) -> Tensor:
+    """Depths (B, 3, 1, H, W) against the lengths of the steps that lead away from them."""
+    pairs = list(motions)
+    return depth_from_steps(torch.cat([depth[:, i] for i, _ in pairs]), torch.cat([motions[pair] for pair in pairs]),
+                            torch.cat([batch.step_m[:, min(pair)] for pair in pairs]))
 
 
 def _of_view(batch: TripletBatch, target: Tensor) -> TripletBatch:

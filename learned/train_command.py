@@ -3,18 +3,26 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 from learned.calibration import card_of, write_calibrated
 from learned.distributed import leads
 from learned.methods import method_config
-from learned.train_config import MEASURED_BRANCH, MEASURED_FUSION, TrainConfig, train_config
+from learned.train_config import (
+    MEASURED_BRANCH,
+    MEASURED_FUSION,
+    MEASURED_STEP_LENGTH_WEIGHT,
+    TrainConfig,
+    train_config,
+)
 from learned.training import train
 from learned.weights import save_weights
 from vio.calibration import load_yaml
 from vio.errors import ConfigError
 from vio.recording import Recording
+from vio.trajectory import Trajectory
 
 WEIGHTS = "weights.safetensors"
 DIRECT = ("loss", "steps", "batch_size", "seed", "workers", "patience")
@@ -22,7 +30,8 @@ DIRECT = ("loss", "steps", "batch_size", "seed", "workers", "patience")
 
 
 def run_training(recordings: Sequence[Recording], calibrate_on: Sequence[Recording], options: Mapping[str, Any],
-                 progress: Callable[[int, int], None] | None = None) -> str:
+                 progress: Callable[[int, int], None] | None = None,
+                 taught_by: Sequence[Trajectory | None] | None = None) -> str:
     """Train, write `RUN/weights.safetensors`, and say what came of it in one line.
 
     Args:
@@ -30,12 +39,16 @@ def run_training(recordings: Sequence[Recording], calibrate_on: Sequence[Recordi
         calibrate_on: with truth; none = the validation split of the recordings, where all have truth.
         options: of the command line, by name.
         progress: called with (steps done, steps in all).
+        taught_by: refined trajectories of the recordings, None where there is none; their steps teach depth.
 
     Raises:
         VioError: options, recordings or a checkpoint that do not fit, see `learned.training.train`.
     """
     config = config_of(options)
-    run = train(recordings, config, options["out"], device=options.get("device"), progress=progress)
+    if taught_by is not None and not config.step_length_weight:
+        config = replace(config, step_length_weight=MEASURED_STEP_LENGTH_WEIGHT)
+    run = train(recordings, config, options["out"], device=options.get("device"), progress=progress,
+                trajectories=taught_by)
     path = Path(options["out"]) / WEIGHTS
     done = f"{path}: {run.step} steps, validation loss {run.validation.get('loss', float('nan')):.4f}"
     if not leads():

@@ -56,6 +56,9 @@ class TrainConfig:
     """Of the network's rotation's L1 distance from the gyro's."""
     unit_depth_weight: float = 0.0
     """Of (mean log depth)², which keeps depth off the ends of its range."""
+    step_length_weight: float = 0.0
+    """Of the distance of depth from what lengths of refined steps make it; needs trajectories beside the recordings,
+    and a method that tells translations in depths. Without it nothing holds the depths of distant frames together."""
     light_start_steps: int = 0
     """Steps over which a pull of depth towards luminance^-1/2 fades out."""
     depth_kind: DepthKind = "z"
@@ -97,12 +100,15 @@ class TrainConfig:
             if getattr(self, name) < 1:
                 raise ConfigError(f"training: {name} is {getattr(self, name)}, must be at least 1")
         for name in ("warm_up_steps", "clip_norm", "rotation_weight", "unit_depth_weight", "light_start_steps",
-                     "workers", "keep_every", "patience", "seed"):
+                     "workers", "keep_every", "patience", "seed", "step_length_weight"):
             if not getattr(self, name) >= 0:
                 raise ConfigError(f"training: {name} is {getattr(self, name)}, must not be negative")
         if not (self.learning_rate > 0 and 0 <= self.ema_decay < 1 and 0 <= self.final_rate <= 1):
             raise ConfigError(f"training: learning_rate {self.learning_rate:g}, ema_decay {self.ema_decay:g}, "
                               f"final_rate {self.final_rate:g}; need > 0, in [0, 1) and in [0, 1]")
+        if self.step_length_weight and not self.method.pose.in_depths:
+            raise ConfigError(f"training: step_length_weight is {self.step_length_weight:g}, but {self.method.name} "
+                              "does not tell translations in depths (pose.in_depths); leave it 0")
 
     @property
     def needs_imu(self) -> bool:
@@ -119,6 +125,8 @@ MEASURED_RECIPE: dict[str, Any] = {
 }
 """What was measured to train our own method within minutes: ten times the paper's rate, the gyro in the warp. With
 fewer than four triplets a process, consider `freeze_batch_norm` once there are weights to start from."""
+MEASURED_STEP_LENGTH_WEIGHT = 0.3
+"""Where refined trajectories are given."""
 MEASURED_FUSION = FusionConfig("fourier", snr_start=4.0, snr_floor=1.0)
 """SNR from where the gain's slope is 0.04 (at 100 it was measured not to learn at all), and never below 1: in one run
 without that floor the last block of the pose network, which no batch norm follows, fell to 0.1 within 200 steps, with a

@@ -8,6 +8,7 @@ it goes on where it stopped, and ends with the same weights, bit for bit, as a r
 
 from __future__ import annotations
 
+import hashlib
 import json
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -33,6 +34,7 @@ from learned.training_source import SourceSettings
 from learned.weights import fill_method
 from vio.atomic import atomic_write
 from vio.recording import Recording
+from vio.trajectory import Trajectory
 
 CHECKPOINT = "checkpoint.pt"
 MOST_LOST = 50  # steps in a row without a finite gradient
@@ -69,8 +71,8 @@ class _EarlyStop:
 
 
 def train(recordings: Sequence[Recording], config: TrainConfig, out: str | Path, *, device: str | None = None,
-          progress: Progress | None = None, start_from: Mapping[str, Tensor] | None = None,
-          alone: bool = False) -> TrainedRun:
+          progress: Progress | None = None, start_from: Mapping[str, Tensor] | None = None, alone: bool = False,
+          trajectories: Sequence[Trajectory | None] | None = None) -> TrainedRun:
     """Train, or go on training.
 
     Under `torchrun` all processes call this; the first writes the files.
@@ -83,16 +85,19 @@ def train(recordings: Sequence[Recording], config: TrainConfig, out: str | Path,
         progress: called with (steps done, steps in all) after every step.
         start_from: weights to start a new run with, by name; None = drawn from the seed.
         alone: train in this process alone, though there are others.
+        trajectories: refined, of the body in metres, one for each recording or None for it; the lengths of their steps
+            teach depth (`TrainConfig.step_length_weight`).
 
     Raises:
         CheckpointError: the folder's checkpoint is damaged, or of a run with other decisions.
         RecordingError, ImuError: recordings that cannot be trained on.
         WeightsError: start weights of another method.
-        TrainingError: gradients stay without finite values.
+        TrainingError: gradients stay without finite values, or no trajectory where step lengths are to teach.
+        TrajectoryError: a trajectory of another time than its recording.
         OutputError: the folder cannot be written.
     """
     with team(device, alone) as members:
-        trainer = Trainer(recordings, config, Path(out), members, start_from)
+        trainer = Trainer(recordings, config, Path(out), members, start_from, trajectories)
         trainer.resume()
         trainer.run(progress)
         return trainer.result()
@@ -107,13 +112,17 @@ class Trainer:
     out: Path
     members: Team = field(default_factory=Team)
     start_from: Mapping[str, Tensor] | None = None
+    trajectories: Sequence[Trajectory | None] | None = None
 
     def __post_init__(self) -> None:
         config, members = self.config, self.members
         torch.manual_seed(1000 * config.seed + members.rank)
         settings = source_settings(config)
-        self.data = TripletDataset(self.recordings, settings, "train", config.seed, config.augment)
-        self.held = TripletDataset(self.recordings, settings, "validation", config.seed, augment=False)
+        if config.step_length_weight and not any(path is not None for path in self.trajectories or ()):
+            raise TrainingError("training: step_length_weight is set, and no recording has a refined trajectory whose "
+                                "steps could teach; give trajectories or leave it 0")
+        self.data = TripletDataset(self.recordings, settings, "train", config.seed, config.augment, self.trajectories)
+        self.held = TripletDataset(self.recordings, settings, "validation", config.seed, False, self.trajectories)
         self.sampler: DistributedSampler[Any] = DistributedSampler(
             self.data, members.size, members.rank, seed=config.seed, drop_last=True)
         self.method = assemble(config.method, seed=config.seed)
@@ -130,7 +139,9 @@ class Trainer:
         self.average = WeightAverage(self.method, config.ema_decay)
         self.step, self.skipped, self.lost_in_a_row, self.stopped = 0, 0, 0, False
         self.early_stop, self.validation = _EarlyStop(), dict[str, float]()
-        self.digests = [_digest(recording) for recording in self.recordings]
+        paths = self.trajectories or [None] * len(self.recordings)
+        self.digests = [_digest(recording) + _path_digest(path)
+                        for recording, path in zip(self.recordings, paths, strict=True)]
         self.logs: tuple[TrainLog, TrainLog] | None = None
         self.sums: dict[str, Tensor] = {}
         self.summed = 0
@@ -320,3 +331,8 @@ def _digest(recording: Recording) -> str:
     """What tells recordings apart without reading their images."""
     first, last = int(recording.frame_t_ns[0]), int(recording.frame_t_ns[-1])
     return f"{recording.name}: {len(recording)} frames {first} to {last}, {len(recording.imu)} samples"
+
+
+def _path_digest(path: Trajectory | None) -> str:
+    """What tells trajectories apart; empty without one."""
+    return "" if path is None else f", taught {hashlib.sha256(path.T_world_body.tobytes()).hexdigest()[:16]}"

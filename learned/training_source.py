@@ -14,15 +14,17 @@ from torch import Tensor
 from learned.frames import resized_rgb
 from learned.windows import ImuWindows
 from vio.camera import Camera
-from vio.errors import ConfigError, ImuError, RecordingError
+from vio.errors import ConfigError, ImuError, RecordingError, TrajectoryError
 from vio.imu import GAP_LIMIT_S, preintegrate_rotation, split_at_frames
 from vio.recording import Recording
 from vio.tracking import DARK_LEVEL, connected_to_border
+from vio.trajectory import Trajectory
 
 Array = NDArray[np.float64]
 Bools = NDArray[np.bool_]
 
 FRAMES_FOR_VIGNETTE = 8
+TIME_SLACK_S = 1e-4  # files of trajectories round their times
 LEAST_USABLE = 0.1  # share of the image; with less there is nothing to train on
 
 
@@ -56,12 +58,19 @@ class SourceSettings:
 class TrainingSource:
     """One recording at the size of the network.
 
+    Args:
+        recording: with images and a calibrated camera.
+        settings: how it is read.
+        trajectory: of the body, metres, such as a refinement of this recording; None = how far the camera moved is not
+            known.
+
     Raises:
         RecordingError: no camera, no images, or nearly all of the image is black.
         ImuError: items with an IMU are asked for and it is absent or does not cover the frames.
+        TrajectoryError: the trajectory is of another time.
     """
 
-    def __init__(self, recording: Recording, settings: SourceSettings) -> None:
+    def __init__(self, recording: Recording, settings: SourceSettings, trajectory: Trajectory | None = None) -> None:
         camera = recording.calibration.camera
         if camera is None:
             raise RecordingError(f"recording {recording.name}: no camera is calibrated, and views are warped through "
@@ -73,6 +82,7 @@ class TrainingSource:
         self.R_body_camera: Array = recording.calibration.T_body_camera[:3, :3]
         self.R_i_j_gyro, self._seen_by_imu = self._gyro()
         self._windows = self._imu_windows()
+        self._position_m = None if trajectory is None else self._positions(trajectory)
         self._frames: Tensor | None = None
         if settings.preload:
             self._frames = torch.stack([self._decode(k) for k in range(len(recording))])
@@ -124,6 +134,27 @@ class TrainingSource:
         if self._windows is None:
             raise ConfigError("training data: without an IMU (imu = False) there are no vibration windows")
         return self._windows.at(self.recording.frame_t_s[index])
+
+    def lengths(self, index: NDArray[np.int64]) -> Array | None:
+        """How far the camera moved (F - 1,) from each of the frames to the next [m]; NaN where the trajectory does not
+        reach, None without a trajectory."""
+        if self._position_m is None:
+            return None
+        return np.asarray(np.linalg.norm(np.diff(self._position_m[index], axis=0), axis=1))
+
+    def _positions(self, trajectory: Trajectory) -> Array:
+        """Of the camera at each frame (N, 3) [m], NaN outside the trajectory's time."""
+        t = self.recording.frame_t_s
+        there = (t >= trajectory.t_s[0] - TIME_SLACK_S) & (t <= trajectory.t_s[-1] + TIME_SLACK_S)
+        if not there.any():
+            raise TrajectoryError(
+                f"recording {self.recording.name}: the trajectory given for it spans {trajectory.t_s[0]:.3f} to "
+                f"{trajectory.t_s[-1]:.3f} s, the frames {t[0]:.3f} to {t[-1]:.3f} s; give its own refinement")
+        inside = np.clip(t[there], trajectory.t_s[0], trajectory.t_s[-1])
+        T_world_camera = trajectory.interpolate(inside).T_world_body @ self.recording.calibration.T_body_camera
+        positions = np.full((len(t), 3), np.nan)
+        positions[there] = T_world_camera[:, :3, 3]
+        return positions
 
     def _decode(self, k: int) -> Tensor:
         image = resized_rgb(self.recording.frame(k), (self.settings.height, self.settings.width))
