@@ -26,7 +26,7 @@ SMALL = SourceSettings(height=32, width=32)
 
 
 def same(one: Triplet, other: Triplet) -> bool:
-    return all(torch.equal(a, b) if isinstance(a, torch.Tensor) else a == b
+    return all(torch.allclose(a, b, rtol=0, atol=0, equal_nan=True) if isinstance(a, torch.Tensor) else a == b
                for a, b in zip(vars(one).values(), vars(other).values(), strict=True))
 
 
