@@ -15,7 +15,7 @@ which gives the marginals, and joint samples at any blocks, in steps that add an
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TypeAlias
 
 import numpy as np
@@ -147,6 +147,14 @@ class ChainFactor:
         if self.system.far is not None:
             x = Conditioned(self.system.far, self._solved, len(x)).solution(x)
         return x.reshape(-1, DIM)[:self.system.nodes]
+
+    def solve_columns(self, right: Array) -> Array:
+        """The (M, 16, c) solutions for other right-hand sides (N, 16, c); far factors want nothing moved."""
+        x = self._solved(right.reshape(-1, right.shape[2]))
+        if self.system.far is not None:
+            still = replace(self.system.far, b=np.zeros_like(self.system.far.b))
+            x = Conditioned(still, self._solved, len(x)).solution(x)
+        return x.reshape(-1, DIM, right.shape[2])[:self.system.nodes]
 
     def _solved(self, right: Array) -> Array:
         """H⁻¹ of columns (n, c), by the band alone."""

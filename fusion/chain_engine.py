@@ -61,14 +61,19 @@ class ChainEngine:
         return Uncertainty(np.ascontiguousarray(cov[:, POSE, POSE]), variance, joint)
 
     def response(self, begin: Begin, term: MotionTerm, blocks: Linearized, error: Array) -> Step:
-        """How the solution moves when the motions' whitened measurements do; one factorisation."""
-        system = begin.model.linearize(begin.values, term)
-        weighted = (error * term.losses(blocks.squared_norm)[1][:, None])[:, :, None]
-        system.gradient.fill(0.0)
+        """How the solution moves when the motions' whitened measurements do."""
+        return self.responses(begin, term, blocks, error[None])[0]
+
+    def responses(self, begin: Begin, term: MotionTerm, blocks: Linearized, errors: Array) -> list[Step]:
+        """`response` to each of a few errors (S, N, 6); one factorisation."""
+        factor = begin.model.linearize(begin.values, term).factor()
+        weight = term.losses(blocks.squared_norm)[1]
+        weighted = np.moveaxis(errors, 0, 2) * weight[:, None, None]
+        gradient = np.zeros((*factor.system.gradient.shape, len(errors)))
         for node, A in ((term.motions.i, blocks.A_i), (term.motions.j, blocks.A_j)):
-            np.add.at(system.gradient[:, POSE], node, (np.swapaxes(A, 1, 2) @ weighted)[:, :, 0])
+            np.add.at(gradient[:, POSE], node, np.swapaxes(A, 1, 2) @ weighted)
         if term.segment is not None:
-            np.add.at(system.gradient[:, 0], term.motions.i, (np.swapaxes(blocks.A_s, 1, 2) @ weighted)[:, 0, 0])
-        x = system.factor().solve()
-        scale = np.zeros(len(term.motions)) if term.segment is None else x[term.motions.i, 0]
-        return Step(np.ascontiguousarray(x[:, POSE]), scale)
+            np.add.at(gradient[:, 0], term.motions.i, (np.swapaxes(blocks.A_s, 1, 2) @ weighted)[:, 0])
+        x = factor.solve_columns(gradient)
+        scale = np.zeros((len(term.motions), len(errors))) if term.segment is None else x[term.motions.i, 0]
+        return [Step(np.ascontiguousarray(x[:, POSE, k]), scale[:, k]) for k in range(len(errors))]

@@ -184,6 +184,11 @@ class ResumableEngine:
         """As `ChainEngine.response`; quicker to compute again than to store."""
         return self.engine.response(begin, term, blocks, error)
 
+    def responses(self, begin: Begin, term: MotionTerm, blocks: Linearized,
+                  errors: NDArray[np.float64]) -> list[Step]:
+        """As `ChainEngine.responses`."""
+        return self.engine.responses(begin, term, blocks, errors)
+
     def _next(self, kind: str) -> str:
         self._calls += 1
         return f"{self._calls:02d}_{kind}"

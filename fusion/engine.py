@@ -74,6 +74,10 @@ class Engine(Protocol):
         """Covariances at `begin.values`; segments are None where scale is held."""
         ...
 
+    def responses(self, begin: Begin, term: MotionTerm, blocks: Linearized, errors: Array) -> list[Step]:
+        """`response` to each of a few errors (S, N, 6)."""
+        ...
+
     def response(self, begin: Begin, term: MotionTerm, blocks: Linearized, error: Array) -> Step:
         """How the solution `begin.values` moves when the motions' whitened measurements move by `error` (N, 6).
 

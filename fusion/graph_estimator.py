@@ -13,6 +13,7 @@ from fusion.body_motion import BodyMotion, without_body_motion
 from fusion.chain_engine import ChainEngine
 from fusion.checkpoint import Checkpoint, ResumableEngine
 from fusion.config import RefineConfig
+from fusion.correlated_noise import with_lasting_errors
 from fusion.engine import Begin, Engine, Uncertainty
 from fusion.estimate import Estimate, add_scale_uncertainty
 from fusion.graph import read_log_scales, read_states
@@ -257,8 +258,12 @@ class GraphEstimator:
     def _uncertainty(self, final: _Pass) -> Uncertainty:
         estimated = final.term.segment is not None
         begin = Begin(final.model, final.solution.values)
-        return self.engine.uncertainty(begin, final.term, self.segments if estimated else None,
-                                       np.random.default_rng(SEED))
+        segments = self.segments if estimated else None
+        unsure = self.engine.uncertainty(begin, final.term, segments, np.random.default_rng(SEED))
+        if self.problem.error_correlation_s == 0:
+            return unsure
+        return with_lasting_errors(self.engine, begin, final.term, self.problem, segments, unsure,
+                                   np.random.default_rng(SEED + 3))
 
     def _gated(self, huber: _Pass) -> _Pass:
         """Reject what lies beyond the gate, solve as Gaussian, narrow the gate, and look again until it is settled."""

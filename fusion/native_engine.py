@@ -56,10 +56,18 @@ class NativeEngine:
         joint = sample_graph(gaussian, nodes, None if segments is None else segments.of_node, rng)
         return Uncertainty(cov, variance, joint)
 
+    def responses(self, begin: Begin, term: MotionTerm, blocks: Linearized, errors: Array) -> list[Step]:
+        """`response` to each of a few errors (S, N, 6)."""
+        still = self._step(begin, term, blocks)
+        found = []
+        for error in errors:
+            moved = self._step(begin, term, replace(blocks, b=blocks.b + error))
+            found.append(Step(moved.pose - still.pose, moved.scale - still.scale))
+        return found
+
     def response(self, begin: Begin, term: MotionTerm, blocks: Linearized, error: Array) -> Step:
         """How the solution moves when the motions' whitened measurements do: one step less another."""
-        still, moved = (self._step(begin, term, replace(blocks, b=b)) for b in (blocks.b, blocks.b + error))
-        return Step(moved.pose - still.pose, moved.scale - still.scale)
+        return self.responses(begin, term, blocks, error[None])[0]
 
     @staticmethod
     def _step(begin: Begin, term: MotionTerm, blocks: Linearized) -> Step:

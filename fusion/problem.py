@@ -60,6 +60,8 @@ class Problem:
     """(S,) their stamps on the frames' clock."""
     scale_gain_sd: float = 0.0
     """How far the motions' single steps may be scaled otherwise than the path, in log (`meta` of the motions)."""
+    error_correlation_s: float = 0.0
+    """How long errors of the motions' translations last (`meta` of the motions); 0 = no longer than a motion."""
     motion_noise: tuple[float, float] = (1.0, 1.0)
     """Factors on the noise of rotation and translation that the motions claimed; already in `motions`."""
 
@@ -100,17 +102,18 @@ def build_problem(recording: Recording, motions: RelativeMotions) -> Problem:
         accel_inflation=holes * clipped[1] * accel_inflation, gyro_inflation=holes * clipped[0] * gyro_inflation,
         motions=batch,
         scale_log_mean=motions.scale_log_mean, scale_log_sd=motions.scale_log_sd, noise=noise,
-        gyro_bias_rad_s=gyro_bias, samples=recording.imu, imu_t_s=imu_t, scale_gain_sd=_scale_gain_sd(motions),
+        gyro_bias_rad_s=gyro_bias, samples=recording.imu, imu_t_s=imu_t,
+        scale_gain_sd=_said_of_itself(motions, "scale_gain_sd", "a standard deviation of the log scale"),
+        error_correlation_s=_said_of_itself(motions, "error_correlation_s", "a time in seconds"),
     )
 
 
-def _scale_gain_sd(motions: RelativeMotions) -> float:
-    """What the source says of itself; the largest of several."""
+def _said_of_itself(motions: RelativeMotions, key: str, what: str) -> float:
+    """A number that the source says of itself in `meta`; the largest of several."""
     sources = [motions.meta, *motions.meta.get("sources", [])]
-    given = [meta["scale_gain_sd"] for meta in sources if "scale_gain_sd" in meta]
-    if not all(isinstance(sd, (int, float)) and 0 <= sd < np.inf for sd in given):
-        raise MotionsError(f"motions: meta scale_gain_sd is {given[0]!r}; give a standard deviation of the log scale, "
-                           "0 or more")
+    given = [meta[key] for meta in sources if key in meta]
+    if not all(isinstance(value, (int, float)) and 0 <= value < np.inf for value in given):
+        raise MotionsError(f"motions: meta {key} is {given[0]!r}; give {what}, 0 or more")
     return float(max(given, default=0.0))
 
 

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from fusion.checkpoint import Checkpoint, refinement_key
 from fusion.config import RefineConfig
+from fusion.correlated_noise import long_run
 from fusion.ekf import ekf_estimate
 from fusion.estimate import Estimate, motions_estimate
 from fusion.graph_estimator import GraphEstimator
@@ -94,7 +95,7 @@ def _first_that_works(problem: Problem, motions: RelativeMotions, config: Refine
     first_R = _level_first(problem)
     try:
         with stages("ekf"):
-            estimate = _sane(ekf_estimate(problem, first_R, config.initial), "ekf")
+            estimate = _sane(ekf_estimate(long_run(problem), first_R, config.initial), "ekf")
         return estimate, "ekf", "; ".join(reasons) or None
     except EstimationError as error:
         if config.estimator == "ekf":
@@ -102,7 +103,7 @@ def _first_that_works(problem: Problem, motions: RelativeMotions, config: Refine
         reasons.append(str(error))
     with stages("motions"):
         first = se3.transform(first_R, np.zeros(3))
-        estimate = _sane(motions_estimate(problem, motions, first, config.initial.tilt_sd_rad), "motions")
+        estimate = _sane(motions_estimate(long_run(problem), motions, first, config.initial.tilt_sd_rad), "motions")
     return estimate, "motions", "; ".join(reasons)
 
 

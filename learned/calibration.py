@@ -16,6 +16,7 @@ import numpy as np
 from learned.aligned_calibration import aligned_section
 from learned.dataset import frames_of_split
 from learned.depth_calibration import depth_uncertainty_section
+from learned.error_correlation import error_correlation_s
 from learned.errors import TrainingError, WeightsError
 from learned.evaluation import depth_score, motion_score, nees_of
 from learned.inference import SIGNALS
@@ -104,7 +105,7 @@ def calibrated(measured: Sequence[Measured]) -> dict[str, Any]:
         **depth_sections(used, model, float(np.mean(scales))),
         "scale_log_mean": float(np.mean(scales)), "scale_log_sd": max(spread, LEAST_SCALE_SD),
         "uncertainty": model.to_dict(),
-        "scale_gain_sd": scale_gain_sd(used),
+        "scale_gain_sd": scale_gain_sd(used), "error_correlation_s": error_correlation_s(used, model),
         "calibration": {"pairs": pairs, "recordings": len(used), "nees": float(nees_of(used, model, SIGNALS).mean()),
                         "depth": None if depth is None else asdict(depth), "motion": asdict(motion)},
     }

@@ -68,10 +68,14 @@ class NetworkPredictor:
         return float(self.weights.card["scale_log_sd"])
 
     @property
-    def scale_gain_sd(self) -> float | None:
-        """How far the scale of single steps is off that of the path, in log; None from cards that do not say."""
-        value = self.weights.card.get("scale_gain_sd")
-        return None if value is None else float(value)
+    def said_of_itself(self) -> dict[str, float]:
+        """What the card says of the motions' errors beyond their covariances, for `meta` of the motions.
+
+        `scale_gain_sd`: how far the scale of single steps is off that of the path, in log; `error_correlation_s`: how
+        long errors of translation last. Absent where the card does not say.
+        """
+        card = self.weights.card
+        return {key: float(card[key]) for key in ("scale_gain_sd", "error_correlation_s") if card.get(key) is not None}
 
     @property
     def card(self) -> Mapping[str, Any]:

@@ -105,8 +105,8 @@ def predict(
     t = recording.frame_t_s
     meta: dict[str, Any] = {"source": "learned", "predictor": dict(predictor.card), "library_version": _version(),
                             "rotation": rotation}
-    if isinstance(predictor, NetworkPredictor) and predictor.scale_gain_sd is not None:
-        meta["scale_gain_sd"] = predictor.scale_gain_sd
+    if isinstance(predictor, NetworkPredictor):
+        meta |= predictor.said_of_itself
     run = PredictionRun(recording, predictor, batch_size, progress)
     with ExitStack() as stack:
         if depth_dir is not None:

@@ -1,0 +1,103 @@
+"""What errors of motions that last for several frames do to a trajectory: more than independent ones of the same size.
+
+The graph weighs motions as if their errors were independent, which costs little accuracy; how sure it is has to be said
+for the errors as they are. A part of variance a = 2 ρ / (1 + ρ) that decays by ρ from motion to motion is added to the
+whitened errors: slow errors are then as large as those of a first-order process of unit variance, quick ones stay a
+little larger. Drawn, and sent through the solved graph's linear response, it widens covariances and joint samples.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fusion.engine import Begin, Engine, Uncertainty
+from fusion.graph import read_poses
+from fusion.joint import SAMPLES, JointSamples
+from fusion.problem import Problem
+from fusion.scale import Segments
+from fusion.scaled_motion import linearize
+from fusion.solve import MotionTerm
+
+Array = NDArray[np.float64]
+
+DRAWS = SAMPLES
+AT_ONCE = 10
+"""Draws that are solved for together: what memory holds for a whole examination."""
+
+
+def with_lasting_errors(engine: Engine, begin: Begin, term: MotionTerm, problem: Problem, segments: Segments | None,
+                        unsure: Uncertainty, rng: np.random.Generator) -> Uncertainty:
+    """Uncertainty widened for translation errors that last `problem.error_correlation_s`.
+
+    Args:
+        engine: that solved the graph.
+        begin: all other factors, and the solution.
+        term: the motions as they were solved.
+        problem: whose motions they are.
+        segments: of the log scales; None where scale is held.
+        unsure: what the graph claims for independent errors.
+        rng: source of the draws.
+
+    Raises:
+        EstimationError: the linear system has no unique solution.
+    """
+    blocks = linearize(term.motions, *read_poses(begin.values), term.log_scale(begin.values))
+    errors = lasting_errors(problem.t_s[term.motions.i], problem.error_correlation_s, DRAWS, rng)
+    cov, variance, joint = unsure.cov.copy(), unsure.log_scale_variance.copy(), unsure.joint
+    xi, log_scale = (None, None) if joint is None else (joint.xi.copy(), joint.log_scale.copy())
+    for first in range(0, DRAWS, AT_ONCE):
+        steps = engine.responses(begin, term, blocks, errors[first:first + AT_ONCE])
+        for draw, step in enumerate(steps, first):
+            cov += step.pose[:, :, None] * step.pose[:, None, :] / DRAWS
+            of_segment = np.zeros(len(variance))
+            if term.segment is not None:
+                of_segment[term.segment] = step.scale
+                variance += of_segment**2 / DRAWS
+            if joint is not None and xi is not None and log_scale is not None:
+                xi[draw] += step.pose[joint.node]
+                if segments is not None:
+                    log_scale[draw] += of_segment[segments.of_node[joint.node]]
+    if joint is not None and xi is not None and log_scale is not None:
+        joint = JointSamples(joint.node, xi, log_scale)
+    return Uncertainty(cov, variance, joint)
+
+
+def lasting_errors(t_s: Array, correlation_s: float, draws: int, rng: np.random.Generator) -> Array:
+    """(draws, N, 6) whitened errors of motions that begin at t_s (N,), of translation only.
+
+    A first-order process in time: what two motions share decays with the time between them.
+    """
+    order = np.argsort(t_s, kind="stable")
+    step_s = np.diff(t_s[order])
+    kept = np.exp(-step_s / correlation_s)
+    apart_s = float(np.median(step_s[step_s > 0])) if (step_s > 0).any() else correlation_s
+    share = lasting_share(np.exp(-apart_s / correlation_s))
+    white = rng.standard_normal((draws, len(t_s), 3))
+    process = np.empty_like(white)
+    process[:, 0] = white[:, 0]
+    for k, rho in enumerate(kept):
+        process[:, k + 1] = rho * process[:, k] + np.sqrt(1 - rho**2) * white[:, k + 1]
+    errors = np.zeros((draws, len(t_s), 6))
+    errors[:, order, 3:] = np.sqrt(share) * process
+    return errors
+
+
+def lasting_share(rho: float) -> float:
+    """Variance of the part to add for errors of correlation `rho` from motion to motion."""
+    return 2 * rho / (1 + rho)
+
+
+def long_run(problem: Problem) -> Problem:
+    """The problem with translation noise as large as lasting errors make it in the long run, for what has no response.
+
+    Variance times (1 + ρ) / (1 - ρ): right for a path of many motions, too large for a few.
+    """
+    if problem.error_correlation_s == 0:
+        return problem
+    rho = np.exp(-float(np.median(problem.dt_s)) / problem.error_correlation_s)
+    factor = np.sqrt((1 + rho) / (1 - rho))
+    return replace(problem, motions=replace(
+        problem.motions, whiten=problem.motions.whiten / np.repeat([1.0, factor], 3)))
