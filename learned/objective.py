@@ -30,7 +30,7 @@ from learned.losses.masks import visible_from
 from learned.losses.priors import depth_like_light, rotation_from_gyro
 from learned.losses.resolution_adaptive import ResolutionAdaptive, resolution_adaptive_loss, scale_views
 from learned.losses.snippet import Snippet, both_directions
-from learned.losses.step_lengths import depth_from_steps
+from learned.losses.step_lengths import length_difference, with_length
 from learned.losses.terms import LossTerms
 from learned.methods import Method, MethodOutput, snr_summary
 from learned.train_config import TrainConfig
@@ -56,9 +56,9 @@ class Objective(nn.Module):
         self.with_flows = native and method.optical_flow is not None
         self.stages: tuple[str, ...] = ("flow", "motion") if self.with_flows else ("motion",)
         """Losses of one training step, in order; their weights are disjoint."""
-        if config.step_length_weight and self._motion_loss() != self._consistency:
-            raise ConfigError(f"training: step_length_weight does not go with the loss of {config.method.name}; take "
-                              "loss='paper' or leave it 0")
+        if config.needs_lengths and self._motion_loss() != self._consistency:
+            raise ConfigError(f"training: refined lengths do not go with the loss of {config.method.name}; take "
+                              "loss='paper', or length_from='network' and length_weight=0")
 
     def train(self, mode: bool = True) -> Objective:
         """Train or eval mode; frozen batch norms stay in eval mode."""
@@ -114,14 +114,17 @@ class Objective(nn.Module):
         rotation = self._rotation_loss(out, batch)
         in_warp = {pair: self._in_warp(T.float(), pair, batch) for pair, T in motions.items()}
         in_warp = tied(in_warp) if self.config.tied_motions else in_warp
+        if self.config.length_from == "refined":
+            unit_m = self.config.length_unit_m
+            in_warp = {pair: with_length(T, batch.step_m[:, min(pair)], unit_m) for pair, T in in_warp.items()}
         usable = batch.usable[:, None].expand(-1, 3, -1, -1, -1)
         snippet = Snippet(batch.images, depth, in_warp, batch.cameras, usable)
         terms = consistency_loss(snippet, self._consistency_settings(batch))
         parts = dict(terms.parts) | _snr(out) | {"gyro_rotation": rotation.detach(), "step_length": _length(motions)}
         total = terms.total + self.config.rotation_weight * rotation
-        if self.config.step_length_weight:
-            taught = _taught_by_steps(motions, depth, batch)
-            total, parts["step_lengths"] = total + self.config.step_length_weight * taught, taught.detach()
+        if self.config.length_weight:
+            apart = self._length_loss(motions, depth, batch)
+            total, parts["step_lengths"] = total + self.config.length_weight * apart, apart.detach()
         share = 1 - step / self.config.light_start_steps if self.config.light_start_steps else 0.0
         if share > 0 and self.training:
             light = depth_like_light(depth.flatten(0, 1), batch.images.flatten(0, 1))
@@ -150,6 +153,14 @@ class Objective(nn.Module):
             return batch.step_s.new_zeros(())
         each = [rotation_from_gyro(so3_log(T[:, :3, :3]), gyro_rotation(batch, pair)) for pair, T in out.T_i_j.items()]
         return torch.stack(each).mean()
+
+    def _length_loss(self, motions: dict[tuple[int, int], Tensor], depth: Tensor, batch: TripletBatch) -> Tensor:
+        """How far the network's step lengths are from the refined ones; depth (B, 3, 1, H, W)."""
+        pairs = list(motions)
+        depth_i = torch.cat([depth[:, i] for i, _ in pairs]) if self.config.method.pose.in_depths else None
+        return length_difference(torch.cat([motions[pair] for pair in pairs]),
+                                 torch.cat([batch.step_m[:, min(pair)] for pair in pairs]),
+                                 self.config.length_unit_m, depth_i)
 
     def _resolution_adaptive(self, batch: TripletBatch, step: int) -> LossTerms:
         generator = torch.Generator().manual_seed(1_000_003 * self.config.seed + step)
@@ -218,13 +229,6 @@ def gyro_rotation(batch: TripletBatch, pair: tuple[int, int]) -> Tensor:
     assert batch.R_i_j_gyro is not None
     forward = batch.R_i_j_gyro[:, min(pair)]
     return forward if pair[0] < pair[1] else forward.transpose(1, 2)
-
-
-def _taught_by_steps(motions: dict[tuple[int, int], Tensor], depth: Tensor, batch: TripletBatch) -> Tensor:
-    """Depths (B, 3, 1, H, W) against the lengths of the steps that lead away from them."""
-    pairs = list(motions)
-    return depth_from_steps(torch.cat([depth[:, i] for i, _ in pairs]), torch.cat([motions[pair] for pair in pairs]),
-                            torch.cat([batch.step_m[:, min(pair)] for pair in pairs]))
 
 
 def _of_view(batch: TripletBatch, target: Tensor) -> TripletBatch:

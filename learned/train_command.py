@@ -13,7 +13,7 @@ from learned.methods import method_config
 from learned.train_config import (
     MEASURED_BRANCH,
     MEASURED_FUSION,
-    MEASURED_STEP_LENGTH_WEIGHT,
+    MEASURED_LENGTHS,
     TrainConfig,
     train_config,
 )
@@ -45,8 +45,8 @@ def run_training(recordings: Sequence[Recording], calibrate_on: Sequence[Recordi
         VioError: options, recordings or a checkpoint that do not fit, see `learned.training.train`.
     """
     config = config_of(options)
-    if taught_by is not None and not config.step_length_weight:
-        config = replace(config, step_length_weight=MEASURED_STEP_LENGTH_WEIGHT)
+    if taught_by is not None and not config.needs_lengths:
+        config = replace(config, **MEASURED_LENGTHS)
     run = train(recordings, config, options["out"], device=options.get("device"), progress=progress,
                 trajectories=taught_by)
     path = Path(options["out"]) / WEIGHTS

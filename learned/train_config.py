@@ -13,6 +13,7 @@ from vio.errors import ConfigError
 Schedule = Literal["constant", "cosine"]
 LossKind = Literal["native", "paper"]
 RotationFrom = Literal["gyro", "network"]
+LengthFrom = Literal["refined", "network"]
 Precision = Literal["float32", "bfloat16"]
 
 BOOKKEEPING = ("steps", "workers", "preload", "log_every", "validate_every", "validation_batches", "checkpoint_every",
@@ -56,9 +57,13 @@ class TrainConfig:
     """Of the network's rotation's L1 distance from the gyro's."""
     unit_depth_weight: float = 0.0
     """Of (mean log depth)², which keeps depth off the ends of its range."""
-    step_length_weight: float = 0.0
-    """Of the distance of depth from what lengths of refined steps make it; needs trajectories beside the recordings,
-    and a method that tells translations in depths. Without it nothing holds the depths of distant frames together."""
+    length_from: LengthFrom = "network"
+    """Whose step lengths warp the images; "refined" needs trajectories beside the recordings. Without it nothing holds
+    the depths of distant frames together."""
+    length_unit_m: float = 0.02
+    """Metres that one motion unit stands for where lengths are refined."""
+    length_weight: float = 0.0
+    """Of the distance of the network's log step lengths from the refined ones."""
     light_start_steps: int = 0
     """Steps over which a pull of depth towards luminance^-1/2 fades out."""
     depth_kind: DepthKind = "z"
@@ -91,7 +96,7 @@ class TrainConfig:
 
     def __post_init__(self) -> None:
         for name, kind in (("loss", LossKind), ("schedule", Schedule), ("rotation_from", RotationFrom),
-                           ("precision", Precision), ("depth_kind", DepthKind)):
+                           ("length_from", LengthFrom), ("precision", Precision), ("depth_kind", DepthKind)):
             if getattr(self, name) not in get_args(kind):
                 raise ConfigError(f"training: {name} {getattr(self, name)!r} is unknown, choose one of "
                                   f"{', '.join(get_args(kind))}")
@@ -100,15 +105,19 @@ class TrainConfig:
             if getattr(self, name) < 1:
                 raise ConfigError(f"training: {name} is {getattr(self, name)}, must be at least 1")
         for name in ("warm_up_steps", "clip_norm", "rotation_weight", "unit_depth_weight", "light_start_steps",
-                     "workers", "keep_every", "patience", "seed", "step_length_weight"):
+                     "workers", "keep_every", "patience", "seed", "length_weight"):
             if not getattr(self, name) >= 0:
                 raise ConfigError(f"training: {name} is {getattr(self, name)}, must not be negative")
+        if not self.length_unit_m > 0:
+            raise ConfigError(f"training: length_unit_m is {self.length_unit_m:g}, must be positive")
         if not (self.learning_rate > 0 and 0 <= self.ema_decay < 1 and 0 <= self.final_rate <= 1):
             raise ConfigError(f"training: learning_rate {self.learning_rate:g}, ema_decay {self.ema_decay:g}, "
                               f"final_rate {self.final_rate:g}; need > 0, in [0, 1) and in [0, 1]")
-        if self.step_length_weight and not self.method.pose.in_depths:
-            raise ConfigError(f"training: step_length_weight is {self.step_length_weight:g}, but {self.method.name} "
-                              "does not tell translations in depths (pose.in_depths); leave it 0")
+
+    @property
+    def needs_lengths(self) -> bool:
+        """Whether some recording must come with a refined trajectory."""
+        return self.length_from == "refined" or self.length_weight > 0
 
     @property
     def needs_imu(self) -> bool:
@@ -125,8 +134,8 @@ MEASURED_RECIPE: dict[str, Any] = {
 }
 """What was measured to train our own method within minutes: ten times the paper's rate, the gyro in the warp. With
 fewer than four triplets a process, consider `freeze_batch_norm` once there are weights to start from."""
-MEASURED_STEP_LENGTH_WEIGHT = 0.3
-"""Where refined trajectories are given."""
+MEASURED_LENGTHS: dict[str, Any] = {"length_from": "refined", "length_weight": 0.1, "unit_depth_weight": 0.0}
+"""Where refined trajectories are given: lengths then keep depth off the ends of its range."""
 MEASURED_FUSION = FusionConfig("fourier", snr_start=4.0, snr_floor=1.0)
 """SNR from where the gain's slope is 0.04 (at 100 it was measured not to learn at all), and never below 1: in one run
 without that floor the last block of the pose network, which no batch norm follows, fell to 0.1 within 200 steps, with a

@@ -86,7 +86,7 @@ def train(recordings: Sequence[Recording], config: TrainConfig, out: str | Path,
         start_from: weights to start a new run with, by name; None = drawn from the seed.
         alone: train in this process alone, though there are others.
         trajectories: refined, of the body in metres, one for each recording or None for it; the lengths of their steps
-            teach depth (`TrainConfig.step_length_weight`).
+            teach depth (`TrainConfig.length_from`, `length_weight`).
 
     Raises:
         CheckpointError: the folder's checkpoint is damaged, or of a run with other decisions.
@@ -118,9 +118,9 @@ class Trainer:
         config, members = self.config, self.members
         torch.manual_seed(1000 * config.seed + members.rank)
         settings = source_settings(config)
-        if config.step_length_weight and not any(path is not None for path in self.trajectories or ()):
-            raise TrainingError("training: step_length_weight is set, and no recording has a refined trajectory whose "
-                                "steps could teach; give trajectories or leave it 0")
+        if config.needs_lengths and not any(path is not None for path in self.trajectories or ()):
+            raise TrainingError("training: step lengths are to come from refined trajectories, and no recording has "
+                                "one; give trajectories, or length_from='network' and length_weight=0")
         self.data = TripletDataset(self.recordings, settings, "train", config.seed, config.augment, self.trajectories)
         self.held = TripletDataset(self.recordings, settings, "validation", config.seed, False, self.trajectories)
         self.sampler: DistributedSampler[Any] = DistributedSampler(

@@ -1,4 +1,4 @@
-"""Lengths of refined steps teach depth: through depth alone, only where they are known, and it works."""
+"""Lengths of refined steps in the warp and beside it: only where they are known, and depth becomes metric."""
 
 import json
 
@@ -10,10 +10,11 @@ from fusion.cli import main
 from fusion.teaching import teaching_trajectories
 from learned.dataset import TripletDataset
 from learned.errors import CheckpointError, TrainingError
-from learned.losses.step_lengths import UNIT_M, depth_from_steps
+from learned.losses.step_lengths import length_difference, with_length
 from learned.measured import measure
-from learned.methods import method_config
-from learned.train_config import MEASURED_STEP_LENGTH_WEIGHT, train_config
+from learned.methods import assemble, method_config
+from learned.objective import Objective
+from learned.train_config import train_config
 from learned.training import Trainer, train
 from learned.training_source import SourceSettings
 from vio import se3
@@ -25,6 +26,7 @@ from vio.trajectory import Trajectory
 
 CAMERA = Camera("pinhole", 64, 64, 42, 44, 30.5, 33.0)
 SMALL = SourceSettings(height=32, width=32)
+UNIT_M = 0.02
 
 
 @pytest.fixture(scope="module")
@@ -40,41 +42,58 @@ def ball(folder, written):
 def tiny(**options):
     method = method_config("gyro-correlation", width=0.125, image_size=(64, 64), branch={"dropout": 0.0})
     return train_config(method, **{"steps": 2, "batch_size": 2, "validate_every": 2, "precision": "float32",
-                                   "light_start_steps": 0, "step_length_weight": 1.0} | options)
+                                   "light_start_steps": 0, "length_from": "refined", "length_weight": 1.0} | options)
 
 
-def steps_of(share: torch.Tensor, depth: torch.Tensor) -> torch.Tensor:
-    """`T_i_j` whose translation is `share` (N, 3) of the typical depth."""
-    T = torch.eye(4, dtype=depth.dtype).repeat(len(share), 1, 1)
-    return torch.cat([torch.cat([T[:, :3, :3], (share * depth.log().mean((1, 2, 3)).exp()[:, None])[..., None]], 2),
-                      T[:, 3:]], 1)
+def motions(rng: torch.Generator, count: int) -> torch.Tensor:
+    T = torch.eye(4, dtype=torch.float64).repeat(count, 1, 1)
+    T[:, :3, 3] = 0.1 * torch.randn(count, 3, generator=rng, dtype=torch.float64)
+    return T
 
 
-def test_the_loss_is_the_log_ratio_and_its_gradient_is_depths_alone():
+def test_a_known_length_takes_the_networks_place_and_leaves_the_direction():
+    T = motions(torch.Generator().manual_seed(1), 4).requires_grad_()
+    step_m = torch.tensor([0.004, 0.001, torch.nan, 0.0])
+    out = with_length(T, step_m, UNIT_M)
+    length = out[:, :3, 3].norm(dim=1)
+    torch.testing.assert_close(length[:2], step_m[:2].double() / UNIT_M)
+    torch.testing.assert_close(out[2], T[2])
+    assert length[3] == 0
+    cosine = (out[:2, :3, 3] * T[:2, :3, 3]).sum(1) / length[:2] / T[:2, :3, 3].norm(dim=1)
+    torch.testing.assert_close(cosine, torch.ones(2, dtype=torch.float64))
+    out.sum().backward()
+    along = (T.grad[:2, :3, 3] * T[:2, :3, 3]).sum(1)  # a longer step of the network changes nothing
+    torch.testing.assert_close(along, torch.zeros(2, dtype=torch.float64), atol=1e-9, rtol=0)
+    still = with_length(torch.eye(4)[None].requires_grad_(), torch.tensor([0.004]), UNIT_M)
+    assert torch.isfinite(still).all()
+
+
+def test_the_loss_is_the_log_ratio_of_lengths_and_leaves_depth_alone():
     rng = torch.Generator().manual_seed(3)
     depth = (0.3 * torch.randn(5, 1, 8, 8, generator=rng, dtype=torch.float64)).exp().requires_grad_()
-    share = (0.1 * torch.randn(5, 3, generator=rng, dtype=torch.float64)).requires_grad_()
-    T = steps_of(share, depth)
-    right = UNIT_M * T[:, :3, 3].norm(dim=1).detach()
-    assert depth_from_steps(depth, T, right).item() < 1e-12
-    assert depth_from_steps(depth, T, 1.5 * right).item() == pytest.approx(np.log(1.5))
-    depth_from_steps(depth, T, 1.5 * right).backward()
-    assert share.grad is None or not share.grad.any()
-    assert (depth.grad < 0).all()  # deeper is nearer to what the longer step says
-    scaled = depth.detach() * 1.5
-    assert depth_from_steps(scaled, steps_of(share.detach(), scaled), 1.5 * right).item() < 1e-12
+    share = motions(rng, 5)[:, :3, 3].requires_grad_()
+    T = torch.eye(4, dtype=torch.float64).repeat(5, 1, 1)
+    shift = share * depth.log().mean((1, 2, 3)).exp()[:, None]
+    T = torch.cat([T[:, :, :3], torch.cat([shift, torch.ones(5, 1)], 1)[..., None]], 2)
+    known = UNIT_M * shift.norm(dim=1).detach()
+    assert length_difference(T, known, UNIT_M, depth).item() < 1e-12
+    loss = length_difference(T, 1.5 * known, UNIT_M, depth)
+    assert loss.item() == pytest.approx(np.log(1.5))
+    loss.backward()
+    assert depth.grad.abs().max() < 1e-12
+    assert ((share.grad * share).sum(1) < 0).all()  # longer is better
 
 
 def test_unknown_and_vanishing_steps_count_for_nothing():
-    depth = torch.full((3, 1, 4, 4), 0.7, requires_grad=True)
-    T = steps_of(torch.tensor([[0.1, 0, 0], [0.1, 0, 0], [0.0, 0, 0]]), depth)
-    loss = depth_from_steps(depth, T, torch.tensor([0.0021, torch.nan, 0.004]))
+    T = torch.eye(4).repeat(3, 1, 1)
+    T[:2, 0, 3] = 0.07
+    T.requires_grad_()
+    loss = length_difference(T, torch.tensor([0.0021, torch.nan, 0.004]), UNIT_M, None)
     assert loss.item() == pytest.approx(abs(np.log(0.0021 / UNIT_M / 0.07)), rel=1e-4)
     loss.backward()
-    assert torch.isfinite(depth.grad).all() and not depth.grad[1:].any()
-    none = depth_from_steps(depth, T, torch.full((3,), torch.nan))
-    assert none.item() == 0
-    short = depth_from_steps(depth, T, torch.tensor([0.0021, 1e-5, torch.nan]))
+    assert torch.isfinite(T.grad).all() and not T.grad[1:].any()
+    assert length_difference(T, torch.full((3,), torch.nan), UNIT_M, None).item() == 0
+    short = length_difference(T, torch.tensor([0.0021, 1e-5, torch.nan]), UNIT_M, None)
     assert short.item() == pytest.approx(loss.item(), rel=1e-2)  # a hundredth of a millimetre says nothing
 
 
@@ -93,24 +112,24 @@ def test_items_carry_the_cameras_steps_lever_arm_included(ball):
 
 
 def test_taught_depth_takes_the_size_of_the_world(ball, tmp_path):
-    """The same film from a walk of centimetres and of metres: an untrained network sees shorter steps than the walker
-    of the one takes, and longer than the other's."""
+    """The same film of a ball of half a unit and of three: only the lengths of the walk tell them apart."""
     depths = []
-    for size in (1e-3, 1.0):
+    for size in (0.01, 0.06):
         T_world_camera = ball.truth.T_world_body @ ball.calibration.T_body_camera
         T_world_camera[:, :3, 3] *= size
         path = Trajectory(ball.truth.t_s, T_world_camera @ se3.inverse(ball.calibration.T_body_camera))
-        config = tiny(steps=25, learning_rate=3e-3, validate_every=25, warm_up_steps=0, ema_decay=0.0)
+        config = tiny(steps=60, learning_rate=3e-3, validate_every=60, warm_up_steps=0, ema_decay=0.0)
         run = train([ball], config, tmp_path / str(size), trajectories=[path], alone=True)
         depths.append(measure(run.method, config.depth_kind, ball).depth)
     assert np.log(np.median(depths[1]) / np.median(depths[0])) > 0.2
 
 
 def test_teaching_without_a_teacher_is_refused(ball, tmp_path):
-    with pytest.raises(TrainingError, match="no recording has a refined trajectory"):
+    with pytest.raises(TrainingError, match="no recording has one"):
         Trainer([ball], tiny(), tmp_path)
-    with pytest.raises(ConfigError, match="does not tell translations in depths"):
-        train_config("af-sfmlearner", step_length_weight=0.3)
+    method = method_config("af-sfmlearner", width=0.125, image_size=(64, 64))
+    with pytest.raises(ConfigError, match="do not go with the loss of af-sfmlearner"):
+        Objective(assemble(method), train_config(method, length_weight=0.3))
 
 
 def test_another_teacher_is_another_run(ball, tmp_path):
@@ -150,7 +169,7 @@ def test_the_command_line_teaches(ball, folder, tmp_path, capsys):
                "--batch-size", "2", "--device", "cpu", "--out", str(out), "--calibrate", str(folder / "ball"),
                "--refined", str(free)]
     main(command)
-    assert json.loads((out / "config.json").read_text())["step_length_weight"] == MEASURED_STEP_LENGTH_WEIGHT
+    assert json.loads((out / "config.json").read_text())["length_from"] == "refined"
     assert "step_lengths" in (out / "train.csv").read_text().splitlines()[0]
     capsys.readouterr()
     assert main([*command, str(free)]) == UsageError("").exit_code
