@@ -8,7 +8,9 @@ little larger. Drawn, and sent through the solved graph's linear response, it wi
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -68,21 +70,30 @@ def with_lasting_errors(engine: Engine, begin: Begin, term: MotionTerm, problem:
 def lasting_errors(t_s: Array, correlation_s: float, draws: int, rng: np.random.Generator) -> Array:
     """(draws, N, 6) whitened errors of motions that begin at t_s (N,), of translation only.
 
-    A first-order process in time: what two motions share decays with the time between them.
+    What two motions share decays with the time between them.
     """
-    order = np.argsort(t_s, kind="stable")
-    step_s = np.diff(t_s[order])
-    kept = np.exp(-step_s / correlation_s)
+    step_s = np.diff(np.sort(t_s))
     apart_s = float(np.median(step_s[step_s > 0])) if (step_s > 0).any() else correlation_s
     share = lasting_share(np.exp(-apart_s / correlation_s))
-    white = rng.standard_normal((draws, len(t_s), 3))
-    process = np.empty_like(white)
-    process[:, 0] = white[:, 0]
-    for k, rho in enumerate(kept):
-        process[:, k + 1] = rho * process[:, k] + np.sqrt(1 - rho**2) * white[:, k + 1]
     errors = np.zeros((draws, len(t_s), 6))
-    errors[:, order, 3:] = np.sqrt(share) * process
+    errors[:, :, 3:] = np.sqrt(share) * first_order(t_s, correlation_s, rng.standard_normal((draws, len(t_s), 3)))
     return errors
+
+
+def first_order(t_s: Array, correlation_s: float, white: Array) -> Array:
+    """A first-order process of unit variance at times t_s (N,), in any order, driven by white noise (S, N, c)."""
+    order = np.argsort(t_s, kind="stable")
+    process = white[:, order]
+    for k, rho in enumerate(np.exp(-np.diff(t_s[order]) / correlation_s)):
+        process[:, k + 1] = rho * process[:, k] + np.sqrt(1 - rho**2) * process[:, k + 1]
+    return np.asarray(process[:, np.argsort(order)])
+
+
+def lasting(problem: Problem) -> Callable[[Array], Array] | None:
+    """White noise (S, N, c) of the problem's motions → errors of unit variance as they last; None where they do not."""
+    if problem.error_correlation_s == 0:
+        return None
+    return partial(first_order, problem.t_s[problem.motions.i], problem.error_correlation_s)
 
 
 def lasting_share(rho: float) -> float:

@@ -13,7 +13,7 @@ from fusion.body_motion import BodyMotion, without_body_motion
 from fusion.chain_engine import ChainEngine
 from fusion.checkpoint import Checkpoint, ResumableEngine
 from fusion.config import RefineConfig
-from fusion.correlated_noise import with_lasting_errors
+from fusion.correlated_noise import lasting, with_lasting_errors
 from fusion.engine import Begin, Engine, Uncertainty
 from fusion.estimate import Estimate, add_scale_uncertainty
 from fusion.graph import read_log_scales, read_states
@@ -94,7 +94,7 @@ class GraphEstimator:
             final, conclusion, fixed_chi2, inflation = self._solve()
             with self.stages("motion_noise"):
                 factor = translation_noise(self.engine, Begin(final.model, final.solution.values), final.term,
-                                           np.random.default_rng(SEED))
+                                           np.random.default_rng(SEED), lasting(self.problem))
             if is_right(factor) if noise == 1.0 else abs(factor - 1) < SETTLED:
                 break
             noise *= factor

@@ -4,10 +4,14 @@ With whitened residuals r and redundancy 3 n - tr(P) of the n accepted motions' 
 by the factor sqrt(rᵀr / redundancy) (Förstner, Zeitschrift für Vermessungswesen 104, 1979). P, the part of the errors
 that the estimate follows, is as large as the graph; its trace is that of random probes z: E[zᵀPz] = tr(P) (Hutchinson,
 Comm. Stat. Sim. 18, 1989). One probe costs one linear solve.
+
+Errors that last are followed further by the estimate and leave smaller residuals. The redundancy is then what probes of
+such errors leave, in place of independent ones.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -19,6 +23,7 @@ from fusion.scaled_motion import Linearized, ScaledMotions, linearize
 from fusion.solve import MotionTerm
 
 Array = NDArray[np.float64]
+Lasting = Callable[[Array], Array]
 
 PROBED_MOTIONS = 4000
 """Motions times probes: the factor is then known to a few percent."""
@@ -57,7 +62,8 @@ def with_noise(motions: ScaledMotions, rotation: float, translation: float) -> S
     return replace(motions, whiten=motions.whiten / np.repeat([rotation, translation], 3))
 
 
-def translation_noise(engine: Engine, begin: Begin, term: MotionTerm, rng: np.random.Generator) -> float:
+def translation_noise(engine: Engine, begin: Begin, term: MotionTerm, rng: np.random.Generator,
+                      lasting: Lasting | None = None) -> float:
     """Real over claimed standard deviation of the translations; 1 where the data do not tell.
 
     Args:
@@ -65,6 +71,7 @@ def translation_noise(engine: Engine, begin: Begin, term: MotionTerm, rng: np.ra
         begin: all other factors, and the common solution.
         term: the motions as they were solved; those with weight below 1 are left out.
         rng: source of the probes.
+        lasting: white noise (S, N, 3) → errors of unit variance as they last; None where they do not.
 
     Raises:
         EstimationError: the linear system has no unique solution.
@@ -75,14 +82,22 @@ def translation_noise(engine: Engine, begin: Begin, term: MotionTerm, rng: np.ra
     blocks = linearize(term.motions, *read_poses(begin.values), term.log_scale(begin.values))
     residual2 = float((blocks.b[accepted, 3:] ** 2).sum())
     probes = max(1, round(PROBED_MOTIONS / len(term.motions)))
-    followed = 0.0
+    redundancy = 3.0 * int(accepted.sum())
     for _ in range(probes):
-        z = np.zeros((len(term.motions), 6))
-        z[:, 3:] = rng.standard_normal((len(z), 3)) * accepted[:, None]
-        moved = engine.response(begin, term, blocks, z)
-        followed += float((z[:, 3:] * _predicted(blocks, term.motions, moved))[accepted].sum()) / probes
-    redundancy = 3 * int(accepted.sum()) - followed
+        white = rng.standard_normal((1, len(term.motions), 3))
+        z, followed = white[0], _followed(engine, begin, term, blocks, white[0] * accepted[:, None])
+        redundancy -= float((z * followed)[accepted].sum()) / probes
+        if lasting is not None:
+            longer = lasting(white)[0]
+            left = longer - _followed(engine, begin, term, blocks, longer * accepted[:, None])
+            redundancy += float((left**2 - (z - followed) ** 2)[accepted].sum()) / probes
     return bounded(np.sqrt(residual2 / redundancy)) if redundancy > LEAST_REDUNDANCY else 1.0
+
+
+def _followed(engine: Engine, begin: Begin, term: MotionTerm, blocks: Linearized, error: Array) -> Array:
+    """(N, 3) by how much the predicted whitened translations follow errors (N, 3) of the measured ones."""
+    z = np.concatenate([np.zeros_like(error), error], axis=1)
+    return _predicted(blocks, term.motions, engine.response(begin, term, blocks, z))
 
 
 def _predicted(blocks: Linearized, motions: ScaledMotions, change: Step) -> Array:
