@@ -41,7 +41,8 @@ class Inspection:
 
     def to_dict(self) -> dict[str, Any]:
         """Plain values for `--json`."""
-        checks = [{"name": c.name, "level": c.level, "text": c.text, "remedy": c.remedy} for c in self.checks]
+        checks = [{"name": c.name, "level": c.level, "text": c.text, "remedy": c.remedy, "judged": c.judged}
+                  for c in self.checks]
         return {"usable": self.usable, "facts": self.facts, "checks": checks}
 
 
@@ -210,7 +211,8 @@ def format_inspection(inspection: Inspection) -> str:
     width = max(len(check.name) for check in inspection.checks)
     lines = []
     for check in inspection.checks:
-        lines.append(f"{marks[check.level]}  {check.name.ljust(width)}  {check.text}")
+        mark = marks[check.level] if check.judged else "-      "
+        lines.append(f"{mark}  {check.name.ljust(width)}  {check.text}")
         lines += [f"{' ' * (width + 11)}to do: {check.remedy}"] if check.remedy else []
     verdict = "usable" if inspection.usable else "cannot be refined as it is"
     return "\n".join([f"recording {inspection.facts['name']}: {verdict}", *lines])
