@@ -25,7 +25,7 @@
   function lookAtAll(key) {
     const { data, layout } = figures[key];
     const wide = document.getElementById(key).clientWidth;
-    const narrow = wide < NARROW_PX, labels = narrow ? 52 : 46, text = { size: narrow ? 11 : 13 };
+    const narrow = wide < NARROW_PX, labels = narrow ? 64 : 50, text = { size: narrow ? 11 : 13 };
     layout.height = narrow ? 430 : 600;
     const sizes = ["x", "y", "z"].map((axis) => {
       Object.assign(layout.scene[`${axis}axis`], { nticks: narrow ? 4 : 0, tickfont: text });

@@ -74,8 +74,9 @@ def test_letters_of_the_pictures_can_be_read_on_a_wide_and_on_a_narrow_page(exam
     for width in (1280, 390):
         tab.show(tmp_path / "page.html", width=width)
         tab.ask("new Promise(done => document.readyState === 'complete' ? done() : addEventListener('load', done))")
-        boxes = tab.ask("[...document.querySelectorAll('figure')].map(figure => [...figure.querySelectorAll('svg text')]"
-                        ".map(t => t.getBoundingClientRect()).filter(b => b.width).map(b => [b.left, b.right, b.height]))")
+        boxes = tab.ask("[...document.querySelectorAll('figure')].map(one => [...one.querySelectorAll('svg text')]"
+                        ".map(t => t.getBoundingClientRect()).filter(b => b.width)"
+                        ".map(b => [b.left, b.right, b.height]))")
         assert len(boxes) == 7
         for left, right, height in np.concatenate([np.array(b) for b in boxes]):
             assert 0 <= left < right <= width and 11 <= height <= 24
