@@ -183,7 +183,7 @@ def _refine(arguments: argparse.Namespace) -> int:
     if arguments.loops_from is not None:
         inputs["loops"] = arguments.loops_from
     if arguments.online and (arguments.loops or arguments.loops_from):
-        raise UsageError("loops are closed when a recording is whole: --online goes without --loops and --loops-from")
+        raise UsageError("loops are closed when a recording is whole; leave out --online, or --loops and --loops-from")
     with unfinished(arguments.out) as kept:
         motions = _motions(arguments, recording, inputs, kept)
         loops = _loops(arguments, recording, motions, kept)

@@ -14,7 +14,7 @@ import numpy as np
 
 from fusion.config import RefineConfig
 from fusion.result import Refinement
-from fusion.run_states import inertial_arrays, joint_arrays, view_arrays
+from fusion.run_states import inertial_arrays, joint_arrays, name_of, view_arrays
 from fusion.summary import summarize
 from vio.atomic import atomic_folder
 from vio.errors import FormatError
@@ -91,7 +91,7 @@ def read_run(folder: str | Path) -> Run:
     folder = Path(folder)
     summary = read_summary(folder)
     refined, motions_only = read_tum(folder / "trajectory.tum"), read_tum(folder / "motions_only.tum")
-    return Run(folder.resolve().name, refined, motions_only, summary)
+    return Run(name_of(folder, summary), refined, motions_only, summary)
 
 
 def read_summary(folder: str | Path) -> dict[str, Any]:
@@ -157,6 +157,13 @@ def _version(distribution: str) -> str | None:
 
 
 def sha256_of(path: Path) -> str:
-    """Hexadecimal SHA-256 of a file, read in blocks."""
-    with path.open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()
+    """Hexadecimal SHA-256 of a file, read in blocks.
+
+    Raises:
+        FormatError: the file cannot be read.
+    """
+    try:
+        with path.open("rb") as file:
+            return hashlib.file_digest(file, "sha256").hexdigest()
+    except OSError as error:
+        raise FormatError(f"{path.name}: cannot be read ({error.strerror or error}); give a file that can") from None

@@ -79,8 +79,13 @@ def read_refinement(folder: str | Path) -> Refinement:
         raise FormatError(f"{name}: {reason}; {AGAIN}") from None
     truth = read_tum(folder / "truth.tum") if (folder / "truth.tum").is_file() else None
     filtered = read_tum(folder / "filtered.tum") if run.summary.get("online") else None
-    return _refinement(folder.name, run.summary, (trajectory, run.motions_only, truth, filtered), states,
+    return _refinement(run.name, run.summary, (trajectory, run.motions_only, truth, filtered), states,
                        arrays["rejected"], joint, view, inertial)
+
+
+def name_of(folder: Path, summary: dict[str, Any]) -> str:
+    """What a run is called: its folder as it was given, and what it was written as where that says nothing (`.`)."""
+    return folder.name if folder.name.strip(".") else str(summary.get("name") or "run")
 
 
 def read_header(folder: Path, summary: dict[str, Any], first: FrameBlock, m: int) -> Refinement:
@@ -103,7 +108,7 @@ def read_header(folder: Path, summary: dict[str, Any], first: FrameBlock, m: int
     states = {"velocity": np.zeros((1, 3)), "gyro_bias": first.gyro_bias_rad_s, "accel_bias": first.accel_bias_m_s2,
               "log_scale": first.log_scale, "log_scale_sd": first.log_scale_sd}
     trajectories = first.refined, first.motions_only, first.truth, first.refined
-    return _refinement(folder.name, summary, trajectories, states, rejected, joint, view, inertial)
+    return _refinement(name_of(folder, summary), summary, trajectories, states, rejected, joint, view, inertial)
 
 
 def _refinement(folder: str, summary: dict[str, Any],

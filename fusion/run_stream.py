@@ -21,6 +21,7 @@ from fusion.run_folder import read_summary
 from fusion.run_states import AGAIN, SHAPES, read_header
 from vio import se3
 from vio.alignment import associate
+from vio.calibration import short_name
 from vio.errors import FormatError, TrajectoryError, VioError
 from vio.motions import UNREADABLE
 from vio.trajectory import Trajectory
@@ -44,7 +45,7 @@ class RunFrames:
 
     def __init__(self, folder: str | Path) -> None:
         self._folder = Path(folder)
-        self._name = f"{self._folder.resolve().name}/trajectory.npz"
+        self._name = short_name(self._folder / "trajectory.npz")
         summary = read_summary(self._folder)
         with ExitStack() as stack:
             self._count = _NpzRows(stack, self._folder / "trajectory.npz", self._name).count
@@ -144,7 +145,7 @@ class _TumRows:
     """Poses of a TUM file, in order."""
 
     def __init__(self, stack: ExitStack, path: Path) -> None:
-        self.name = f"{path.resolve().parent.name}/{path.name}"
+        self.name = short_name(path)
         try:
             file = stack.enter_context(path.open(encoding="utf-8"))
         except OSError:

@@ -81,7 +81,7 @@ class NetworkPredictor:
     def card(self) -> Mapping[str, Any]:
         """Method, digest and origin of the weights."""
         card = self.weights.card
-        return {"method": card["method"]["name"], "sha256": card["sha256"], "weights": self.weights.name,
+        return {"method": card["method"]["name"], "sha256": card["sha256"],
                 "data": card.get("data", {}).get("summary", "unknown")}
 
     def predict(self, frames_i: torch.Tensor, frames_j: torch.Tensor, imu_windows: torch.Tensor) -> PairPrediction:

@@ -82,7 +82,7 @@ class FrameReader:
         try:
             image = self._recording.frame(k)
         except RecordingError as error:
-            self.unreadable[k] = str(error)
+            self.unreadable[k] = error.nameless
             return None
         image = resized_rgb(image, self._size)
         frame = torch.from_numpy(np.ascontiguousarray(image.transpose(2, 0, 1))).float() / 255

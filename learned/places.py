@@ -77,7 +77,7 @@ def _local_features(recording: Recording, predictor: NetworkPredictor, index: ND
                 images.append(resized_rgb(recording.frame(k), predictor.image_size))
                 read.append(k)
             except RecordingError as error:
-                unreadable[k] = str(error)
+                unreadable[k] = error.nameless
         if read:
             frames = torch.from_numpy(np.stack(images)).permute(0, 3, 1, 2).float().to(predictor.device) / 255
             with torch.inference_mode():

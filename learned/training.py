@@ -330,7 +330,8 @@ def _random_state(device: torch.device) -> dict[str, Any]:
 def _digest(recording: Recording) -> str:
     """What tells recordings apart without reading their images."""
     first, last = int(recording.frame_t_ns[0]), int(recording.frame_t_ns[-1])
-    return f"{recording.name}: {len(recording)} frames {first} to {last}, {len(recording.imu)} samples"
+    text = f"{recording.name}: {len(recording)} frames {first} to {last}, {len(recording.imu)} samples"
+    return hashlib.sha256(text.encode()).hexdigest()[:16]  # names may be patients'
 
 
 def _path_digest(path: Trajectory | None) -> str:

@@ -6,9 +6,19 @@ The command line turns each `VioError` into that line on stderr and an exit code
 
 
 class VioError(Exception):
-    """Root of every error this project raises on purpose. `exit_code` follows the command-line contract."""
+    """Root of every error this project raises on purpose. `exit_code` follows the command-line contract.
+
+    Args:
+        message: the line for whoever typed the command; it may name their files.
+        nameless: the same without names of files and folders, for results that others will read: a name may be a
+            patient's. None where the message holds none.
+    """
 
     exit_code = 3
+
+    def __init__(self, message: str = "", nameless: str | None = None) -> None:
+        super().__init__(message)
+        self.nameless = message if nameless is None else nameless
 
 
 class GeometryError(VioError):

@@ -37,8 +37,8 @@ def decode_image(path: Path, what: str, depth: bool = False) -> NDArray[Any]:
     content = _read_whole(path, what)
     size = image_size(content)
     if size is not None and size[0] * size[1] > MAX_PIXELS:
-        raise RecordingError(f"{what}: {short_name(path)} has {size[0]} x {size[1]} pixels (limit {MAX_PIXELS}); "
-                             "scale the images down, or restore the file if it is damaged")
+        raise _refused(what, path, f"has {size[0]} x {size[1]} pixels (limit {MAX_PIXELS}); scale the images down, or "
+                                   "restore the file if it is damaged")
     flags = cv2.IMREAD_UNCHANGED if depth else cv2.IMREAD_ANYCOLOR | cv2.IMREAD_IGNORE_ORIENTATION
     try:
         with quiet_decoder():
@@ -46,7 +46,7 @@ def decode_image(path: Path, what: str, depth: bool = False) -> NDArray[Any]:
     except cv2.error:
         image = None
     if image is None:
-        raise RecordingError(f"{what}: {short_name(path)} is not an image that can be decoded; restore the file")
+        raise _refused(what, path, "is not an image that can be decoded; restore the file")
     return np.asarray(image)
 
 
@@ -117,8 +117,12 @@ def _read_whole(path: Path, what: str) -> bytes:
         content = path.read_bytes()
     except OSError as error:
         reason = error.strerror or "input error"
-        raise RecordingError(f"{what}: {short_name(path)} cannot be read ({reason}); restore the file") from None
+        raise _refused(what, path, f"cannot be read ({reason}); restore the file") from None
     for start, end in ENDS.items():
         if content.startswith(start) and end not in content[-64:]:
-            raise RecordingError(f"{what}: {short_name(path)} is cut off; copy the file again")
+            raise _refused(what, path, "is cut off; copy the file again")
     return content
+
+
+def _refused(what: str, path: Path, problem: str) -> RecordingError:
+    return RecordingError(f"{what}: {short_name(path)} {problem}", f"{what}: its file {problem}")

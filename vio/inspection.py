@@ -41,7 +41,8 @@ class Inspection:
 
     def to_dict(self) -> dict[str, Any]:
         """Plain values for `--json`."""
-        checks = [{"name": c.name, "level": c.level, "text": c.text, "remedy": c.remedy} for c in self.checks]
+        checks = [{"name": c.name, "level": c.level, "text": c.text, "remedy": c.remedy, "judged": c.judged}
+                  for c in self.checks]
         return {"usable": self.usable, "facts": self.facts, "checks": checks}
 
 
@@ -73,7 +74,7 @@ def _sync(recording: Recording) -> tuple[SyncQuality | None, Check]:
     try:
         sync = sync_quality(recording)
     except VioError as error:
-        return None, Check("sync", "warning", str(error))
+        return None, Check("sync", "warning", error.nameless)
     return sync, sync_check(sync, recording.calibration.time_offset_s)
 
 
@@ -144,7 +145,7 @@ def _whole_images(recording: Recording) -> Check:
     try:
         size = None if first is None else size_of(first, "frame 0")
     except RecordingError as error:
-        return Check("images", "warning", str(error), "restore the files; until then they cannot be predicted on")
+        return Check("images", "warning", error.nameless, "restore the files; until then they cannot be predicted on")
     if camera is not None and size is not None and size != (camera.width, camera.height):
         return Check("images", "warning", f"the images have {size[0]} x {size[1]} pixels but the calibration is for "
                      f"{camera.width} x {camera.height}", "give the calibration of this resolution: prediction and "
@@ -156,7 +157,7 @@ def _imu(recording: Recording) -> list[Check]:
     try:
         report = check_imu(recording.imu, recording.calibration.imu_noise)
     except VioError as error:
-        return [Check("imu", "error", str(error))]
+        return [Check("imu", "error", error.nameless)]
     checks = [Check("imu", "ok", _imu_text(report))]
     return checks + [Check("imu", "warning", text) for text in report.warnings]
 
@@ -170,7 +171,7 @@ def _refinable(recording: Recording) -> Check:
     try:
         check_refinable(recording)
     except VioError as error:
-        return Check("coverage", "error", str(error))
+        return Check("coverage", "error", error.nameless)
     return Check("coverage", "ok", "the IMU covers all frames")
 
 
@@ -210,7 +211,8 @@ def format_inspection(inspection: Inspection) -> str:
     width = max(len(check.name) for check in inspection.checks)
     lines = []
     for check in inspection.checks:
-        lines.append(f"{marks[check.level]}  {check.name.ljust(width)}  {check.text}")
+        mark = marks[check.level] if check.judged else "-      "
+        lines.append(f"{mark}  {check.name.ljust(width)}  {check.text}")
         lines += [f"{' ' * (width + 11)}to do: {check.remedy}"] if check.remedy else []
     verdict = "usable" if inspection.usable else "cannot be refined as it is"
     return "\n".join([f"recording {inspection.facts['name']}: {verdict}", *lines])

@@ -159,8 +159,9 @@ class Recording:
         height, width = image.shape[:2]
         if camera is not None and (width, height) != (camera.width, camera.height):
             where = f"frame {k}" if path is None else f"frame {k} ({path.name})"
-            raise RecordingError(f"{where} has {width} x {height} pixels but the camera {camera.width} x "
-                                 f"{camera.height}; correct the camera's `resolution` and `intrinsics`")
+            problem = (f"has {width} x {height} pixels but the camera {camera.width} x {camera.height}; correct the "
+                       "camera's `resolution` and `intrinsics`")
+            raise RecordingError(f"{where} {problem}", f"frame {k} {problem}")
         return image
 
     def depth_m(self, k: int) -> NDArray[np.float32] | None:
@@ -224,10 +225,12 @@ def check_refinable(recording: Recording) -> Recording:
         ImuError: the inertial samples do not reach over all frames.
     """
     if len(recording) < 2:
-        raise RecordingError(f"recording {recording.name}: {len(recording)} frame; motion needs at least 2")
+        problem = f"{len(recording)} frame; motion needs at least 2"
+        raise RecordingError(f"recording {recording.name}: {problem}", problem)
     if len(recording.imu) < 2:
-        raise RecordingError(f"recording {recording.name}: {len(recording.imu)} inertial samples; refinement needs a "
-                             "stream that covers all frames (imu0/data.csv)")
+        problem = (f"{len(recording.imu)} inertial samples; refinement needs a stream that covers all frames "
+                   "(imu0/data.csv)")
+        raise RecordingError(f"recording {recording.name}: {problem}", problem)
     check_coverage(recording.imu_t_s, recording.frame_t_s)
     return recording
 

@@ -10,7 +10,7 @@ import numpy as np
 from vio.imu import GAP_LIMIT_S, find_gaps
 from vio.recording import Recording
 from vio.spectrum import Spectrum
-from vio.visual_sync import SyncQuality
+from vio.visual_sync import FEWEST_INTERVALS, SyncQuality
 
 Level = Literal["ok", "warning", "error"]
 
@@ -32,6 +32,12 @@ class Check:
     text: str
     remedy: str = ""
     """What to do; empty where nothing needs to be done, or where `text` says so already."""
+    judged: bool = True
+    """False where nothing could be said; `text` says why, and `level` is then "ok"."""
+
+
+def _unjudged(name: str, why: str) -> Check:
+    return Check(name, "ok", f"not judged: {why}", judged=False)
 
 
 def gap_check(recording: Recording) -> Check:
@@ -50,7 +56,7 @@ def gap_check(recording: Recording) -> Check:
 def vibration_checks(spectrum: Spectrum | None) -> list[Check]:
     """Whether noise near the Nyquist frequency is what the calibration says."""
     if spectrum is None:
-        return [Check("vibration", "ok", "not judged: no stretch of 64 samples without a hole")]
+        return [_unjudged("vibration", "no stretch of 64 samples without a hole")]
     top_hz = float(spectrum.frequency_hz[-1])
     text = (f"near {top_hz:.0f} Hz the accelerometer shows {spectrum.accel_over_noise:.1f} times, the gyro "
             f"{spectrum.gyro_over_noise:.1f} times the calibrated noise")
@@ -64,11 +70,12 @@ def vibration_checks(spectrum: Spectrum | None) -> list[Check]:
 def sync_check(sync: SyncQuality | None, declared_offset_s: float) -> Check:
     """Whether camera and gyro tell of the same turns at the same times."""
     if sync is None:
-        return Check("sync", "ok", "not judged: it takes images with texture, a calibrated camera and an IMU over them")
+        return _unjudged("sync", f"it takes {FEWEST_INTERVALS} frame intervals with texture in the images, a "
+                                 "calibrated camera and an IMU over them")
     text = (f"camera and gyro agree over {len(sync.t_s)} frame intervals with correlation "
             f"{sync.best_correlation:.2f}")
     if sync.turn_rms_rad < STILL_RAD:
-        return Check("sync", "ok", f"not judged: it turns only {np.rad2deg(sync.turn_rms_rad):.2f}° per frame")
+        return _unjudged("sync", f"it turns only {np.rad2deg(sync.turn_rms_rad):.2f}° per frame")
     if sync.swapped is not None:
         return Check("sync", "warning", f"{text}, but clearly better if the body's axes were {sync.swapped} of those "
                      "declared", "correct the rotation of T_BS in cam0/sensor.yaml; axes are swapped or mirrored")

@@ -33,6 +33,20 @@ def presentation_times_s(path: Path) -> NDArray[np.float64]:
     return np.array(times)
 
 
+def listed_frames(path: Path) -> int:
+    """How many frames the container says it holds; 0 where it says nothing. An estimate in some containers.
+
+    Raises:
+        RecordingError: the film cannot be opened.
+    """
+    import cv2
+
+    capture = _open(path)
+    count = capture.get(cv2.CAP_PROP_FRAME_COUNT)
+    capture.release()
+    return max(int(count), 0)
+
+
 class VideoFrames:
     """Decodes frame k of a film; quick when frames are asked for in order, right in any order.
 
@@ -75,7 +89,8 @@ class VideoFrames:
 
     def _ended(self, at: int) -> RecordingError:
         usable = f"frames 0 to {at - 1} are usable: shorten the table of times to {at} rows" if at else "none is usable"
-        return RecordingError(f"frame {at}: {short_name(self.path)} cannot be decoded from here on; {usable}")
+        problem = f"cannot be decoded from here on; {usable}"
+        return RecordingError(f"frame {at}: {short_name(self.path)} {problem}", f"frame {at}: the film {problem}")
 
 
 def _open(path: Path) -> Any:

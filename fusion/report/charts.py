@@ -14,9 +14,12 @@ from fusion.report.plot import Line, Panel, ticks
 
 Array = NDArray[np.float64]
 
-WIDTH, HEIGHT = 960, 250
-LEFT, TOP, RIGHT, BOTTOM = 86.0, 26.0, 16.0, 44.0
-POINTS = 2000
+WIDTH, NARROW, HEIGHT = 960, 380, 250
+"""A page that is too narrow for the one width shows the other: letters keep their size."""
+LEFT, TOP, RIGHT, BOTTOM = 66.0, 26.0, 16.0, 44.0
+POINTS_PER_PX = 2
+LETTER_PX = 7.2
+"""Of the legend, about."""
 
 
 @dataclass(frozen=True)
@@ -44,23 +47,28 @@ class Chart:
     """Whether both axes are logarithmic; what is not positive is left out."""
 
 
-def chart_svg(chart: Chart, title: str) -> str:
-    """The chart as an SVG element; values that are not finite leave gaps."""
-    curves = [_prepared(curve, chart.log) for curve in chart.curves]
-    panel = Panel(LEFT, TOP, WIDTH - LEFT - RIGHT, HEIGHT - TOP - BOTTOM, _span([c.x for c in curves], False),
+def chart_svgs(chart: Chart, title: str) -> str:
+    """The chart for wide and for narrow pages; the style sheet shows one of them."""
+    return chart_svg(chart, title, WIDTH, "chart on-wide") + chart_svg(chart, title, NARROW, "chart on-narrow")
+
+
+def chart_svg(chart: Chart, title: str, width: int = WIDTH, kind: str = "chart") -> str:
+    """The chart as an SVG element of class `kind`; values that are not finite leave gaps."""
+    curves = [_prepared(curve, chart.log, POINTS_PER_PX * width) for curve in chart.curves]
+    panel = Panel(LEFT, TOP, width - LEFT - RIGHT, HEIGHT - TOP - BOTTOM, _span([c.x for c in curves], False),
                   _span([c.y for c in curves], chart.zero))
-    body = [*_axes(panel, chart), *(_path(panel, curve) for curve in curves), *_legend(chart.curves)]
-    return (f'<svg class="chart" viewBox="0 0 {WIDTH} {HEIGHT}" role="img" aria-label="{escape(title)}">'
+    body = [*_axes(panel, chart), *(_path(panel, curve) for curve in curves), *_legend(chart.curves, width)]
+    return (f'<svg class="{kind}" viewBox="0 0 {width} {HEIGHT}" role="img" aria-label="{escape(title)}">'
             f"{''.join(body)}</svg>")
 
 
-def _prepared(curve: Curve, log: bool) -> Curve:
+def _prepared(curve: Curve, log: bool, points: int) -> Curve:
     """Logarithms where asked for, and thinned for the eye without losing peaks."""
     x, y = np.asarray(curve.x, float), np.asarray(curve.y, float)
     if log:
         good = (x > 0) & (y > 0)
         x, y = np.log10(x[good]), np.log10(y[good])
-    keep = thin(np.where(np.isfinite(y), y, -np.inf), POINTS) if len(y) else np.zeros(0, np.int64)
+    keep = thin(np.where(np.isfinite(y), y, -np.inf), points) if len(y) else np.zeros(0, np.int64)
     return Curve(curve.kind, x[keep], y[keep], curve.name)
 
 
@@ -87,7 +95,7 @@ def _path(panel: Panel, curve: Curve) -> str:
 def _axes(panel: Panel, chart: Chart) -> list[str]:
     bottom, right = panel.top + panel.height, panel.left + panel.width
     parts = []
-    for value, label in _marks(panel.x, 8, chart.log):
+    for value, label in _marks(panel.x, 8 if panel.width > 500 else 6, chart.log):
         x = float(panel.at(np.array(value), np.array(panel.y[0]))[0])
         parts.append(f'<path class="grid" d="M{x:.1f},{panel.top:g}V{bottom:g}"/>'
                      f'<text x="{x:.1f}" y="{bottom + 18:g}" text-anchor="middle">{label}</text>')
@@ -96,7 +104,7 @@ def _axes(panel: Panel, chart: Chart) -> list[str]:
         parts.append(f'<path class="grid" d="M{panel.left:g},{y:.1f}H{right:g}"/>'
                      f'<text x="{panel.left - 8:g}" y="{y + 4:.1f}" text-anchor="end">{label}</text>')
     return [*parts, f'<text x="{right:g}" y="{bottom + 36:g}" text-anchor="end">{escape(chart.x_label)}</text>',
-            f'<text x="{panel.left:g}" y="{panel.top - 10:g}">{escape(chart.y_label)}</text>']
+            f'<text x="4" y="{panel.top - 10:g}">{escape(chart.y_label)}</text>']
 
 
 def _marks(span: tuple[float, float], about: int, log: bool) -> list[tuple[float, str]]:
@@ -109,11 +117,11 @@ def _marks(span: tuple[float, float], about: int, log: bool) -> list[tuple[float
     return [(value, label) for value, label in at if span[0] <= value <= span[1]]
 
 
-def _legend(curves: Sequence[Curve]) -> list[str]:
-    parts, x = [], WIDTH - RIGHT
-    for curve in reversed([c for c in curves if c.name]):
-        parts.append(f'<text x="{x:g}" y="{TOP - 10:g}" text-anchor="end">{escape(curve.name)}</text>')
-        x -= 7.5 * len(curve.name) + 8
-        parts.append(f'<path class="{curve.kind}" d="M{x - 24:g},{TOP - 14:g} {x:g},{TOP - 14:g}"/>')
-        x -= 42
+def _legend(curves: Sequence[Curve], width: float) -> list[str]:
+    named = [curve for curve in curves if curve.name]
+    parts, x = [], width - RIGHT - sum(LETTER_PX * len(curve.name) + 46 for curve in named) + 16
+    for curve in named:
+        parts += [f'<path class="{curve.kind}" d="M{x:g},{TOP - 14:g} {x + 24:g},{TOP - 14:g}"/>',
+                  f'<text x="{x + 30:g}" y="{TOP - 10:g}">{escape(curve.name)}</text>']
+        x += LETTER_PX * len(curve.name) + 46
     return parts

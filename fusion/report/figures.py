@@ -117,7 +117,8 @@ def _layout(height: int) -> Figure:
         "height": height, "autosize": True, "uirevision": "keep", "paper_bgcolor": "--clear", "plot_bgcolor": "--clear",
         "font": {"family": "system-ui, -apple-system, 'Segoe UI', Roboto, sans-serif", "size": 13, "color": "--muted"},
         "margin": {"l": 64, "r": 12, "t": 30, "b": 44},
-        "legend": {"orientation": "h", "x": 0, "y": 1.02, "xanchor": "left", "yanchor": "bottom",
+        # At the figure's top edge, not above the curves: there it would stay in them when the page grows wider.
+        "legend": {"orientation": "h", "x": 0, "y": 1, "yref": "container", "xanchor": "left", "yanchor": "top",
                    "bgcolor": "--clear", "font": {"color": "--ink"}},
         "modebar": {"bgcolor": "--clear", "color": "--muted", "activecolor": "--ink"},
         "hoverlabel": {"bgcolor": "--card", "bordercolor": "--grid", "font": {"color": "--ink"}},

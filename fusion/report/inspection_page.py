@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusion.report import words
-from fusion.report.charts import Chart, Curve, chart_svg
+from fusion.report.charts import Chart, Curve, chart_svgs
 from vio.atomic import atomic_write
 from vio.imu import GRAVITY_M_S2
 from vio.inertial_levels import InertialLevels, inertial_levels
@@ -66,18 +66,21 @@ def _verdict(inspection: Inspection) -> str:
     warned = sum(check.level == "warning" for check in inspection.checks)
     if warned:
         return f"This recording can be refined. {warned} of {len(inspection.checks)} checks deserve a look."
+    unjudged = sum(not check.judged for check in inspection.checks)
+    if unjudged:
+        return f"This recording can be refined. {unjudged} of {len(inspection.checks)} checks could not be made."
     return "This recording can be refined; every check is fine."
 
 
 def _check(check: Check) -> str:
-    tone, word = MARKS[check.level]
+    tone, word = MARKS[check.level] if check.judged else ("none", "not judged")
     remedy = f'<p class="remedy"><b>What to do:</b> {escape(check.remedy)}</p>' if check.remedy else ""
     return (f'<dt>{escape(check.name)} <span class="mark {tone}">{word}</span></dt>'
             f"<dd>{escape(check.text)}{remedy}</dd>")
 
 
 def _figure(picture: _Picture) -> str:
-    svg = chart_svg(picture.chart, picture.title)
+    svg = chart_svgs(picture.chart, picture.title)
     return f"<figure><h2>{escape(picture.title)}</h2><figcaption>{escape(picture.caption)}</figcaption>{svg}</figure>"
 
 

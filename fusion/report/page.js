@@ -20,10 +20,43 @@
     return value;
   }
 
+  // The view in space from as far away as it takes to see all axes with their labels, however narrow the page.
+  const FIELD = Math.tan(Math.PI / 8), NARROW_PX = 500, LEGEND_PX = 70; // Plotly's vertical field of view, halved
+  function lookAtAll(key) {
+    const { data, layout } = figures[key];
+    const wide = document.getElementById(key).clientWidth;
+    const narrow = wide < NARROW_PX, labels = narrow ? 64 : 50, text = { size: narrow ? 11 : 13 };
+    layout.height = narrow ? 430 : 600;
+    const sizes = ["x", "y", "z"].map((axis) => {
+      Object.assign(layout.scene[`${axis}axis`], { nticks: narrow ? 4 : 0, tickfont: text });
+      layout.scene[`${axis}axis`].title.font = text;
+      let low = Infinity, high = -Infinity;
+      for (const trace of data) for (const v of trace[axis]) if (v !== null) { low = Math.min(low, v); high = Math.max(high, v); }
+      return high - low || 2;
+    });
+    const mean = Math.cbrt(sizes[0] * sizes[1] * sizes[2]); // of Plotly's box with equal scales
+    const { eye, center } = layout.scene.camera;
+    const length = Math.hypot(eye.x, eye.y, eye.z), flat = Math.hypot(eye.x, eye.y);
+    const back = [eye.x / length, eye.y / length, eye.z / length], right = [-eye.y / flat, eye.x / flat, 0];
+    const up = [-eye.z * eye.x / length / flat, -eye.z * eye.y / length / flat, flat / length];
+    const along = (a, b) => Math.abs(a[0] * b[0] + a[1] * b[1] + a[2] * b[2]);
+    const high = layout.height - LEGEND_PX;
+    const reach = (pixels) => FIELD * pixels / high * Math.max(1 - 2 * labels / pixels, 0.3);
+    const far = Math.max(...[0, 1, 2, 3, 4, 5, 6, 7].map((k) => {
+      const corner = [center.x, center.y, center.z].map((middle, axis) => (k >> axis & 1 ? 0.5 : -0.5) * sizes[axis] / mean - middle);
+      const toward = corner[0] * back[0] + corner[1] * back[1] + corner[2] * back[2];
+      return toward + Math.max(along(corner, right) / reach(wide), along(corner, up) / reach(high));
+    }));
+    layout.scene.camera = { eye: { x: far * back[0], y: far * back[1], z: far * back[2] }, center, up: { x: 0, y: 0, z: 1 } };
+  }
+
   const shown = new Set();
   function draw(key) {
     const style = getComputedStyle(document.documentElement);
-    Plotly.react(key, paint(figures[key].data, style), paint(figures[key].layout, style), config);
+    const layout = paint(figures[key].layout, style);
+    const camera = shown.has(key) && document.getElementById(key).layout.scene?.camera;
+    if (camera) layout.scene.camera = camera; // a change of colours does not turn the view
+    Plotly.react(key, paint(figures[key].data, style), layout, config);
     if (shown.has(key)) return;
     if (!shown.size) performance.mark("first-figure");
     shown.add(key);
@@ -108,6 +141,7 @@
     }
   }
 
+  keys.filter((key) => figures[key].layout.scene).forEach(lookAtAll);
   window.reportDrawn = drawAll();
   matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => [...shown].forEach(draw));
   addEventListener("beforeprint", forPaper);

@@ -182,8 +182,9 @@ def _camera_imu(refinement: Refinement) -> str:
     if not found.pairs:
         return f"Their calibration was not checked: {_ended(found.reason)}"
     turn, sd = math.hypot(*found.rotation_rad), max(found.rotation_sd_rad)
+    clock_ms = f"{1e3 * found.time_offset_s:+.1f}".replace("-", "−")
     return (f"The gyro's turns against the motions' put the camera {angle(turn)} (sd {angle(sd)} per axis) off the "
-            f"calibration and the IMU's clock {1e3 * found.time_offset_s:+.1f} ms (sd "
+            f"calibration and the IMU's clock {clock_ms} ms (sd "
             f"{1e3 * found.time_offset_sd_s:.1f} ms): {_ended(found.reason)}")
 
 

@@ -61,18 +61,32 @@ def test_the_page_shows_every_check_and_runs_nothing(examination, tmp_path):
                   "Spectrum of the accelerometer", "Spectrum of the gyro"):
         assert f"<h2>{title}</h2>" in text
     charts = re.findall(r"<svg.*?</svg>", text, re.DOTALL)
-    assert len(charts) == 7
-    intervals = ElementTree.fromstring(charts[1])
-    path = next(e for e in intervals.iter("path") if e.get("class") == "refined").get("d")
-    heights = np.array([pair.split(",") for pair in path[1:].split()], float)[:, 1]
-    assert heights.min() < 60 and np.median(heights) > 190  # the hole of three seconds stands out
+    assert len(charts) == 2 * 7  # for wide pages and for narrow ones
+    for chart in charts[2:4]:
+        path = next(e for e in ElementTree.fromstring(chart).iter("path") if e.get("class") == "refined").get("d")
+        heights = np.array([pair.split(",") for pair in path[1:].split()], float)[:, 1]
+        assert heights.min() < 60 and np.median(heights) > 190  # the hole of three seconds stands out
+
+
+def test_letters_of_the_pictures_can_be_read_on_a_wide_and_on_a_narrow_page(examination, tmp_path, tab):
+    inspection = inspect_recording(examination.recording)
+    write_inspection(examination.recording, inspection, tmp_path / "page.html")
+    for width in (1280, 390):
+        tab.show(tmp_path / "page.html", width=width)
+        tab.ask("new Promise(done => document.readyState === 'complete' ? done() : addEventListener('load', done))")
+        boxes = tab.ask("[...document.querySelectorAll('figure')].map(one => [...one.querySelectorAll('svg text')]"
+                        ".map(t => t.getBoundingClientRect()).filter(b => b.width)"
+                        ".map(b => [b.left, b.right, b.height]))")
+        assert len(boxes) == 7
+        for left, right, height in np.concatenate([np.array(b) for b in boxes]):
+            assert 0 <= left < right <= width and 11 <= height <= 24
 
 
 def test_the_command_prints_what_to_do_and_writes_the_page(examination, tmp_path, capsys):
     write_asl(holed(examination.recording, 20.0, 23.0), tmp_path / "REC")
     assert main(["inspect", str(tmp_path / "REC"), "--html", str(tmp_path / "page.html")]) == 0
     out = capsys.readouterr().out
-    assert "to do: only the motions hold the frames there" in out and "not judged: it takes images" in out
+    assert "to do: only the motions hold the frames there" in out and "-        sync       not judged: it takes" in out
     assert (tmp_path / "page.html").is_file()
     assert main(["inspect", str(tmp_path / "REC"), "--json"]) == 0
     checks = json.loads(capsys.readouterr().out)["checks"]

@@ -160,6 +160,33 @@ def test_every_figure_is_drawn_in_the_readers_colours_and_nothing_is_fetched(tab
     assert tab.ask("document.querySelectorAll('[onerror]').length") == 0
 
 
+@pytest.mark.parametrize("width", [1280, 390, 320])
+def test_axes_of_the_picture_in_space_are_seen_whole(tab, run, tmp_path, width):
+    """Nothing of it, no label either, reaches its edges: there are only pixels of the card."""
+    opened(tab, run, width=width)
+    tab.ask("new Promise(done => setTimeout(done, 500))")
+    left, top, wide, high = tab.ask("(b => [b.left + scrollX, b.top + scrollY, b.width, b.height])"
+                                    "(document.querySelector('#trajectory canvas').getBoundingClientRect())")
+    tab.picture(tmp_path / "page.png")
+    page = cv2.imread(str(tmp_path / "page.png"))
+    shown = page[round(top):round(top + high), round(left):round(left + wide)]
+    card = page[round(top + high) + 4, round(left)]
+    assert (shown != card).any()
+    for edge in (shown[:, :2], shown[:, -2:], shown[:2], shown[-2:]):
+        assert (edge == card).all()
+
+
+def test_legends_stay_above_the_curves_when_a_narrow_page_grows_wide(tab, run):
+    overlaps = ("[...document.querySelectorAll('.plot:has(.gridlayer)')].map(plot => plot.querySelector('.legend')"
+                ".getBoundingClientRect().bottom - plot.querySelector('.gridlayer').getBoundingClientRect().top)")
+    opened(tab, run, width=390)
+    narrow = tab.ask(overlaps)
+    tab.ask("dispatchEvent(new Event('beforeprint'))")
+    paper = tab.ask(overlaps)
+    tab.ask("dispatchEvent(new Event('afterprint'))")
+    assert len(paper) >= 8 and max(narrow) <= 0 and max(paper) <= 0
+
+
 def test_keys_move_turn_and_bring_back(tab, run):
     opened(tab, run)
     eye = "JSON.stringify(document.getElementById('trajectory').layout.scene.camera.eye)"
@@ -174,8 +201,10 @@ def test_keys_move_turn_and_bring_back(tab, run):
     tab.press("+")
     nearer = json.loads(tab.ask(eye))
     assert np.linalg.norm(list(nearer.values())) == pytest.approx(0.8 * np.linalg.norm(list(turned.values())))
+    tab.emulate("dark")
+    assert json.loads(tab.ask(eye)) == nearer  # other colours, the same view
     tab.press("Home")
-    assert json.loads(tab.ask(eye)) == before
+    assert json.loads(tab.ask(eye)) == pytest.approx(before)
     whole = tab.ask(span)
     tab.ask("document.getElementById('error').focus()")
     tab.press("+")

@@ -163,14 +163,14 @@ def test_a_fault_midway_leaves_nothing(recording: Recording, tmp_path: Path) -> 
         learned.predict(recording, BarShift(with_depth=False), depth_dir=out / "depth")
     for path in recording.frame_paths[::2]:
         path.write_bytes(b"")
-    with pytest.raises(RecordingError, match=r"no two frames to compare can be read; frame 0: .*00\.png"):
+    with pytest.raises(RecordingError, match=r"no two frames to compare can be read; frame 0: its file is"):
         learned.predict(recording, BarShift(), depth_dir=out / "depth")
     assert list(out.iterdir()) == []
 
 
 @pytest.mark.parametrize(("damage", "says"), [
-    (lambda path: path.write_bytes(path.read_bytes()[:path.stat().st_size // 2]), "06.png is cut off"),
-    (Path.unlink, "06.png cannot be read"),
+    (lambda path: path.write_bytes(path.read_bytes()[:path.stat().st_size // 2]), "frame 6: its file is cut off"),
+    (Path.unlink, "frame 6: its file cannot be read"),
 ])
 def test_a_damaged_frame_loses_its_motions_and_nothing_stands_in_for_it(recording: Recording, tmp_path: Path, damage,
                                                                         says) -> None:

@@ -272,6 +272,7 @@ def test_a_checkpoint_of_another_run_is_refused(ball, tmp_path):
     train([ball], config, tmp_path)
     with pytest.raises(CheckpointError, match="another learning_rate"):
         train([ball], dataclasses.replace(config, learning_rate=5e-4), tmp_path)
+    assert ball.name.encode() not in (tmp_path / "checkpoint.pt").read_bytes()  # a name may be a patient's
     with pytest.raises(CheckpointError, match="other recordings"):
         train([dataclasses.replace(ball, name="another")], config, tmp_path)
     with pytest.raises(CheckpointError, match="1 process"):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
 
@@ -77,4 +78,5 @@ def open_recording(path: str | Path, format: str | None = None, declared: Declar
         known = "; ".join(f"{name} = {reader.layout}" for name, reader in READERS.items())
         raise RecordingError(f"{path.name}: not a recording in a known format; looked for {known}")
     declared.check_accepted(name, READERS[name].accepts)
-    return READERS[name].read(path, declared)
+    recording = READERS[name].read(path, declared)
+    return recording if recording.name.strip(".") else replace(recording, name="recording")

@@ -144,9 +144,8 @@ def write_asl_files(recording: Recording, folder: Path, check: bool = False, pro
 
 def _folders(path: Path) -> tuple[Path, Path]:
     """The recording's folder and the one that holds the sensors: `mav0`, or itself where that level is left out."""
-    path = path.resolve()
-    if path.name == "mav0":
-        return path.parent, path
+    if path.resolve().name == "mav0":
+        return path.parent if path.name == "mav0" else path / "..", path
     return path, path / "mav0" if (path / "mav0").is_dir() else path
 
 

@@ -27,12 +27,14 @@ from vio.formats.named_table import read_named_table
 from vio.formats.sidecar import read_sidecar
 from vio.imu import ImuSamples
 from vio.recording import Recording
-from vio.video_frames import VideoFrames, presentation_times_s
+from vio.video_frames import VideoFrames, listed_frames, presentation_times_s
 
 LAYOUT = "a film with a table of times (frames.csv, or <film>.csv beside the film)"
 ACCEPTS = frozenset({"calibration", "presentation_times"})
 ENDINGS = {".mp4", ".avi", ".mpg", ".mpeg", ".mkv", ".mov", ".wmv", ".webm"}
 TABLE = "frames.csv"
+SHARE = 0.99
+"""Of the frames that a container lists must decode: some list a frame or two more than there are."""
 HOLE = 1.5
 """A step between presentation times above this many medians counts as missing frames."""
 
@@ -58,6 +60,7 @@ def read_video(path: str | Path, declared: Declared | None = None) -> Recording:
         if table.is_file():
             raise RecordingError(f"{table.name} lists the times of the frames; leave out "
                                  f"{OPTIONS['presentation_times']}, or take the table away")
+        _check_whole(film, shown_s)
         t_ns, clock = _as_capture_times(shown_s), "presentation times, declared to be the capture times"
     else:
         t_ns, clock = _listed_times(table, film, shown_s), "times as listed"
@@ -88,10 +91,21 @@ def _listed_times(table: Path, film: Path, shown_s: NDArray[np.float64]) -> NDAr
         before_hole = _before_hole(shown_s)
         usable = min(before_hole, len(t_ns))
         sure = "a hole follows" if before_hole < len(shown_s) else "if only the end is missing; no hole shows"
+        last_s = 1e-9 * float(t_ns[usable - 1] - t_ns[0]) if usable else 0.0
         raise RecordingError(f"{film.name}: {len(shown_s)} frames decode, but {table.name} lists {len(t_ns)} times; "
-                             f"frames 0 to {usable - 1} can be used ({sure}): cut the film and the table to {usable}, "
-                             "or restore the film")
+                             f"frames 0 to {usable - 1} (0 to {last_s:.3f} s) can be used ({sure}): cut the film and "
+                             f"the table to {usable}, or restore the film")
     return t_ns
+
+
+def _check_whole(film: Path, shown_s: NDArray[np.float64]) -> None:
+    """Refuse a film whose container lists more frames than decode: without a table nothing else tells."""
+    promised = listed_frames(film)
+    if len(shown_s) < SHARE * promised:
+        usable = _before_hole(shown_s)
+        raise RecordingError(f"{film.name}: {len(shown_s)} of {promised} frames decode; frames 0 to {usable - 1} "
+                             f"(0 to {shown_s[usable - 1] - shown_s[0]:.3f} s) can be used: cut the film to {usable}, "
+                             "or restore it")
 
 
 def _before_hole(shown_s: NDArray[np.float64]) -> int:
