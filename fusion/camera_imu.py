@@ -256,8 +256,8 @@ def _search_offset(problem: Problem, pairs: Pairs) -> float:
     seen = np.minimum(seen, 5 * np.median(seen))
     shifts = np.round(np.arange(-SEARCHED_S, SEARCHED_S + 1e-9, SEARCH_STEP_S), 6)
     parts = np.array_split(shifts[:, None], -(-len(seen) * len(shifts) // SEARCHED_AT_ONCE))
-    first, second = problem.t_s[pairs.node], problem.t_s[pairs.node + 1]
-    score = np.concatenate([_correlations(seen, np.interp(second + some, t, turned) - np.interp(first + some, t, turned))
+    first, next_ = problem.t_s[pairs.node], problem.t_s[pairs.node + 1]
+    score = np.concatenate([_correlations(seen, np.interp(next_ + some, t, turned) - np.interp(first + some, t, turned))
                             for some in parts])
     best = int(np.argmax(score))
     calibrated = float(score[np.argmin(np.abs(shifts))])

@@ -148,17 +148,25 @@ def interpolate(T_w_a: ArrayLike, T_w_b: ArrayLike, fraction: ArrayLike) -> Arra
 def chain(T_k_k1: ArrayLike, T_first: ArrayLike | None = None) -> Array:
     """Poses (N+1, 4, 4) of N consecutive relative motions (N, 4, 4), starting at `T_first`.
 
-    A parallel prefix product: log2(N) batched passes instead of a Python loop. Rotations are
-    brought back onto SO(3) after every pass, so 100,000 products stay orthonormal.
+    Stretches of about sqrt(N) motions are chained side by side, and then onto each other. Rotations are brought back
+    onto SO(3) at the end of every stretch, so 100,000 products stay orthonormal.
     """
     steps = np.asarray(T_k_k1, float)
     first = np.eye(4) if T_first is None else np.asarray(T_first, float)
     T = np.concatenate([first[None], steps])
-    shift = 1
-    while shift < len(T):
-        T[shift:] = T[:-shift] @ T[shift:]
-        T[:, :3, :3] = _rotation(T[:, :3, :3]).as_matrix()
-        shift *= 2
+    size = int(np.ceil(np.sqrt(len(T))))
+    stretches = -(-len(T) // size)
+    inside = np.broadcast_to(np.eye(4), (stretches * size, 4, 4)).copy()
+    inside[:len(T)] = T
+    inside = inside.reshape(stretches, size, 4, 4)
+    for k in range(1, size):
+        inside[:, k] = inside[:, k - 1] @ inside[:, k]
+    for k in range(1, stretches):
+        begin = inside[k - 1, -1]
+        begin[:3, :3] = _rotation(begin[:3, :3]).as_matrix()
+        inside[k] = begin @ inside[k]
+    T = inside.reshape(-1, 4, 4)[:len(T)]
+    T[:, :3, :3] = _rotation(T[:, :3, :3]).as_matrix()
     return T
 
 
