@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from fusion.problem import Problem
 from vio import se3
 from vio.errors import ImuError
-from vio.imu import ImuPieces, preintegrate_rotation, split_at_frames
+from vio.imu import gyro_rotations
 
 Array = NDArray[np.float64]
 
@@ -28,12 +28,15 @@ LEAST_PAIRS = 50
 MOST_PAIRS = 9000
 SHAKEN = 3.0
 """Inflation of the gyro above which an interval is left out."""
-ITERATIONS = 8
+ITERATIONS, SETTLED = 8, 1e-4
+"""At most, and the squared step in standard deviations after which none follows."""
 PRIOR_SD = np.array([0.5, 0.5, 0.5, 0.1])
 """Of δ [rad] and of τ about its start [s]: keeps a capsule that does not turn from any conclusion."""
 CAUCHY = 3.0
 MEDIAN_CHI2_3 = 2.366
 SEARCHED_S, SEARCH_STEP_S = 3.0, 0.02
+SEARCHED_AT_ONCE = 50_000
+"""Turns that are interpolated at a time."""
 AROUND_S = 10.0
 """Samples that are looked at before and after the compared motions: more than any offset that can be found."""
 CLEAR_CORRELATION, BETTER_CORRELATION = 0.6, 0.1
@@ -149,12 +152,12 @@ def _pairs_at(problem: Problem, surest: NDArray[np.int64], node: NDArray[np.int6
     chosen = surest[node]
     gyro = np.zeros((0, 3, 3))
     if len(node):
-        gyro = preintegrate_rotation(_pieces(problem, node, 0.0), np.zeros(3))[node - node[0]]
+        gyro = _gyro(problem, node, 0.0, np.zeros(3))
     return Pairs(node, problem.motions.R[chosen], problem.motions.whiten[chosen, :3, :3], gyro)
 
 
-def _pieces(problem: Problem, node: NDArray[np.int64], shift_s: float) -> ImuPieces:
-    """The IMU of the frames from the first to the last compared, read `shift_s` later."""
+def _gyro(problem: Problem, node: NDArray[np.int64], shift_s: float, bias: Array) -> Array:
+    """(K, 3, 3) the gyro's rotations from the frames compared to their next, read `shift_s` later, less a bias."""
     frames = problem.t_s[node[0] : node[-1] + 2] + shift_s
     t = problem.imu_t_s
     inside = slice(max(int(np.searchsorted(t, frames[0])) - 2, 0), int(np.searchsorted(t, frames[-1])) + 2)
@@ -162,7 +165,8 @@ def _pieces(problem: Problem, node: NDArray[np.int64], shift_s: float) -> ImuPie
     cut = type(samples)(samples.t_ns[inside], samples.gyro_rad_s[inside], samples.accel_m_s2[inside])
     # A shift may leave the log: what is beyond it turns by nothing, and counts as outliers.
     reach = np.clip(frames, t[0], t[-1]) + 1e-8 * np.arange(len(frames))
-    return split_at_frames(cut, t[inside], reach)
+    rotations: Array = gyro_rotations(cut, t[inside], reach, bias)[node - node[0]]
+    return rotations
 
 
 def measure_camera_imu(problem: Problem, pairs: Pairs) -> CameraImu:
@@ -180,8 +184,11 @@ def measure_camera_imu(problem: Problem, pairs: Pairs) -> CameraImu:
         weight = 1 / (1 + squared / (CAUCHY**2 * spread2))
         H = np.einsum("nki,n,nkj->ij", J, weight, J) + spread2 * prior
         off = np.concatenate([delta, [tau - start], np.zeros(3)])
-        step = -np.linalg.solve(H, np.einsum("nki,n,nk->i", J, weight, e) + spread2 * prior @ off)
+        gradient = np.einsum("nki,n,nk->i", J, weight, e) + spread2 * prior @ off
+        step = -np.linalg.solve(H, gradient)
         delta, tau, bias = delta + step[:3], tau + float(step[3]), bias + step[4:]
+        if -float(step @ gradient) < SETTLED * spread2:
+            break
     variance = np.diag(np.linalg.inv(H)) * spread2
     sd = np.sqrt(np.maximum(variance, 1e-16))
     return CameraImu(len(pairs), delta, sd[:3], tau, float(sd[3]), float(np.sqrt(spread2)), False,
@@ -223,7 +230,7 @@ def check_clock(problem: Problem) -> None:
 
 def _linearised(problem: Problem, pairs: Pairs, R_bc: Array, tau: float, bias: Array) -> tuple[Array, Array]:
     """Whitened Jacobian (K, 3, 7) by δ, τ and b, and residual (K, 3)."""
-    gyro = preintegrate_rotation(_pieces(problem, pairs.node, tau), bias)[pairs.node - pairs.node[0]]
+    gyro = _gyro(problem, pairs.node, tau, bias)
     predicted = R_bc.T @ gyro @ R_bc
     e = se3.so3_log(np.swapaxes(pairs.R, 1, 2) @ predicted)
     rate_i, rate_j = (_rates(problem, problem.t_s[pairs.node + k] + tau) - bias for k in (0, 1))
@@ -248,14 +255,18 @@ def _search_offset(problem: Problem, pairs: Pairs) -> float:
     seen = np.linalg.norm(se3.so3_log(pairs.R), axis=1)
     seen = np.minimum(seen, 5 * np.median(seen))
     shifts = np.round(np.arange(-SEARCHED_S, SEARCHED_S + 1e-9, SEARCH_STEP_S), 6)
-    score = np.array([_correlation(seen, np.interp(problem.t_s[pairs.node + 1] + s, t, turned)
-                                   - np.interp(problem.t_s[pairs.node] + s, t, turned)) for s in shifts])
+    parts = np.array_split(shifts[:, None], -(-len(seen) * len(shifts) // SEARCHED_AT_ONCE))
+    first, next_ = problem.t_s[pairs.node], problem.t_s[pairs.node + 1]
+    score = np.concatenate([_correlations(seen, np.interp(next_ + some, t, turned) - np.interp(first + some, t, turned))
+                            for some in parts])
     best = int(np.argmax(score))
     calibrated = float(score[np.argmin(np.abs(shifts))])
     clear = score[best] > max(calibrated + BETTER_CORRELATION, CLEAR_CORRELATION)
     return float(shifts[best]) if clear else 0.0
 
 
-def _correlation(a: Array, b: Array) -> float:
-    a, b = a - a.mean(), b - b.mean()
-    return float(a @ b) / max(float(np.linalg.norm(a) * np.linalg.norm(b)), 1e-30)
+def _correlations(a: Array, b: Array) -> Array:
+    """(S,) of one signal (K,) with others (S, K)."""
+    a, b = a - a.mean(), b - b.mean(axis=1, keepdims=True)
+    size = np.linalg.norm(a) * np.sqrt(np.einsum("sk,sk->s", b, b))
+    return np.asarray(b @ a / np.maximum(size, 1e-30))

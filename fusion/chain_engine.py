@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from fusion.chain import POSE
+from fusion.chain import POSE, ChainFactor, ChainSystem
 from fusion.chain_model import LONGEST_REACH, ChainModel, ScaleWalk
 from fusion.chain_solve import chain_gauss_newton
 from fusion.chain_start import chain_start, inertial_steps
@@ -22,7 +22,11 @@ Array = NDArray[np.float64]
 
 
 class ChainEngine:
-    """Solves a recording as a chain of frames."""
+    """Solves a recording as a chain of frames; keeps the memory of its last system, and its factor while that holds."""
+
+    def __init__(self) -> None:
+        self._memory: ChainSystem | None = None
+        self._factored: tuple[Begin, MotionTerm, ChainFactor] | None = None
 
     @staticmethod
     def suits(problem: Problem) -> bool:
@@ -45,13 +49,25 @@ class ChainEngine:
 
     def solve(self, begin: Begin, term: MotionTerm, max_iterations: int, relative_tolerance: float) -> Solution:
         """Gauss-Newton."""
-        return chain_gauss_newton(begin.model, begin.values, term, max_iterations, relative_tolerance)
+        self._factored = None
+        self._memory = begin.model.system(term, self._memory)
+        return chain_gauss_newton(begin.model, begin.values, term, max_iterations, relative_tolerance, self._memory)
+
+    def _factor(self, begin: Begin, term: MotionTerm) -> ChainFactor:
+        """The factor at a solution; the one at hand where it is of the same."""
+        if self._factored is not None:
+            of, of_term, factor = self._factored
+            if of.model is begin.model and of.values is begin.values and of_term is term:
+                return factor
+        self._factored = None
+        self._memory = begin.model.linearize(begin.values, term, self._memory)
+        self._factored = begin, term, self._memory.factor()
+        return self._factored[2]
 
     def uncertainty(self, begin: Begin, term: MotionTerm, segments: Segments | None,
                     rng: np.random.Generator) -> Uncertainty:
         """Covariances and joint samples from one factorisation."""
-        factor = begin.model.linearize(begin.values, term).factor()
-        cov, joint = factor.marginals_and_samples(rng)
+        cov, joint = self._factor(begin, term).marginals_and_samples(rng)
         variance = np.zeros(0)
         if segments is None:  # the band's unknowns of scale mean nothing then
             joint = replace(joint, log_scale=np.zeros_like(joint.log_scale))
@@ -65,8 +81,8 @@ class ChainEngine:
         return self.responses(begin, term, blocks, error[None])[0]
 
     def responses(self, begin: Begin, term: MotionTerm, blocks: Linearized, errors: Array) -> list[Step]:
-        """`response` to each of a few errors (S, N, 6); one factorisation."""
-        factor = begin.model.linearize(begin.values, term).factor()
+        """`response` to each of a few errors (S, N, 6), with the solution's one factor."""
+        factor = self._factor(begin, term)
         weight = term.losses(blocks.squared_norm)[1]
         weighted = np.moveaxis(errors, 0, 2) * weight[:, None, None]
         gradient = np.zeros((*factor.system.gradient.shape, len(errors)))

@@ -17,7 +17,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from fusion.chain import BIAS, BLOCK_NODES, DIM, POSE, SCALE, SCALE_AND_POSE, VELOCITY, ChainSystem, Nodes, spans
+from fusion.chain import BIAS, BLOCK_NODES, DIM, POSE, RIGHT, SCALE, VELOCITY, ChainSystem, spans
 from fusion.chain_far import JOINED, FarFactors
 from fusion.chain_state import ChainState
 from fusion.graph import Anchor
@@ -34,10 +34,11 @@ LONGEST_REACH = 4
 """Frames that a motion of the band may span; the work per frame grows with its square."""
 TIE_INFORMATION = 1e10
 """Ties the copies of one log scale to 1e-5, far closer than any is known."""
-FIRST, SECOND = slice(1, 16), slice(1, 10)
-"""Unknowns of its two frames that an inertial step speaks of."""
-ROTATION, SHIFT, SPEED, ACCEL_BIAS, GYRO_BIAS = (slice(k, k + 3) for k in range(0, 15, 3))
-"""Columns within those."""
+ROTATION, SHIFT, SPEED, ACCEL_BIAS, GYRO_BIAS = (slice(k, k + 3) for k in range(1, 16, 3))
+NEXT_ROTATION, NEXT_SHIFT, NEXT_SPEED = (slice(k, k + 3) for k in range(17, 26, 3))
+NEXT_POSE = slice(17, 23)
+"""Columns of a factor's rows."""
+INERTIAL_ROWS, MOTION_ROWS = 9, 6
 
 
 @dataclass(frozen=True)
@@ -70,7 +71,8 @@ class ChainModel:
         """Half the squared whitened residuals of all factors but the motions."""
         total = 0.5 * float(sum((r**2).sum() for r in self._anchor_residuals(state)))
         for first, last in spans(len(self.steps), BLOCK_NODES):
-            total += 0.5 * float((self._residuals(state, first, last)[0] ** 2).sum())
+            r = _times(self.steps.whiten[first:last], self._residuals(state, first, last)[0])
+            total += 0.5 * float(np.vdot(r, r))
         walked = np.concatenate([np.diff(state.accel_bias, axis=0), np.diff(state.gyro_bias, axis=0)], axis=1)
         total += 0.5 * float(((walked / self.steps.bias_walk_sd) ** 2).sum())
         if self.scale is not None:
@@ -78,64 +80,81 @@ class ChainModel:
             total += 0.5 * float(((np.diff(state.log_scale) / self.scale.step_sd) ** 2).sum())
         return total
 
+    def system(self, term: MotionTerm, memory: ChainSystem | None = None) -> ChainSystem:
+        """A system without factors, in the memory of an earlier one where it fits."""
+        span = term.motions.j - term.motions.i
+        reach = int(span.max(initial=1, where=span <= LONGEST_REACH))
+        if memory is None or (memory.nodes, memory.reach) != (self.nodes, reach):
+            return ChainSystem(self.nodes, reach)
+        memory.clear()
+        return memory
+
     def linearize(self, state: ChainState, term: MotionTerm, memory: ChainSystem | None = None) -> ChainSystem:
-        """Normal equations of all factors and the motions at `state`, in the memory of an earlier one if given."""
+        """Normal equations of all factors and the motions at `state`, in the memory of an earlier one where it fits."""
         span = term.motions.j - term.motions.i
         far = np.flatnonzero(span > LONGEST_REACH)
-        reach = int(span.max(initial=1, where=span <= LONGEST_REACH))
-        system = memory or ChainSystem(self.nodes, reach)
-        if memory is not None:
-            memory.clear()
-        for first, last in spans(len(self.steps), BLOCK_NODES):
-            A_i, A_j, b = self._inertial(state, first, last)
-            system.add(*_pair(first, last, reach), (FIRST, A_i), (SECOND, A_j), b)
+        system = self.system(term, memory)
+        reach = system.reach
+        near = MotionRows(state, term, np.flatnonzero(span <= LONGEST_REACH))
+        together = near.groups if reach == 1 else []
+        rows = np.zeros((min(BLOCK_NODES, self.nodes), INERTIAL_ROWS + MOTION_ROWS * len(together), RIGHT + 1))
+        raw = np.zeros((len(rows), INERTIAL_ROWS, RIGHT + 1))
+        for first, last in spans(self.nodes - 1, BLOCK_NODES):
+            now = rows[:last - first]
+            self._inertial(state, first, last, raw[:last - first])
+            np.matmul(self.steps.whiten[first:last], raw[:last - first], out=now[:, :INERTIAL_ROWS])
+            for k in range(len(together)):
+                near.write(k, first, last, now[:, INERTIAL_ROWS + MOTION_ROWS * k:])
+            if reach == 1:
+                system.add_chain(first, now)
+            else:
+                system.add(np.arange(first, last), np.arange(first + 1, last + 1), now)
+        if reach > 1:
+            near.add(system)
         bias = np.concatenate([state.accel_bias, state.gyro_bias], axis=1)
         system.add_links(BIAS, self.steps.bias_walk_sd**-2, -np.diff(bias, axis=0))
         self._add_anchor(system, state)
         self._add_scale(system, state)
-        near = None if len(far) == 0 else np.flatnonzero(span <= LONGEST_REACH)
-        add_motions(system, state, term, near)
         if len(far):
             system.far = far_factors(state, term, far)
         return system
 
-    def _residuals(self, state: ChainState, first: int, last: int) -> tuple[Array, Array, Array, Array, Array]:
-        """Whitened residuals (B, 9), and what their derivatives need."""
+    def _residuals(self, state: ChainState, first: int, last: int) -> tuple[Array, ...]:
+        """Residuals (B, 9), and what their derivatives need: Exp(e_R), R_kᵀ R_{k+1}, and v and p in body axes."""
         s = self.steps
         now, then = slice(first, last), slice(first + 1, last + 1)
         R_t = np.swapaxes(state.R[now], 1, 2)
         R_ij = R_t @ state.R[then]
         dt, c = s.dt_s[now, None], s.free_fall[now, None]
         gyro, accel = state.gyro_bias[now] - s.gyro_bias, state.accel_bias[now] - s.accel_bias
-        e_R = se3.so3_log(np.swapaxes(s.R[now] @ se3.so3_exp(_times(s.R_bg[now], gyro)), 1, 2) @ R_ij)
+        E = np.swapaxes(s.R[now] @ se3.so3_exp(_times(s.R_bg[now], gyro)), 1, 2) @ R_ij
         dv = _times(R_t, state.v[then] - state.v[now] - c * dt * GRAVITY_WORLD)
         dp = _times(R_t, state.p[then] - state.p[now] - c * (dt * state.v[now] + 0.5 * dt**2 * GRAVITY_WORLD))
         e_v = dv - s.v[now] - _times(s.v_bg[now], gyro) - _times(s.v_ba[now], accel)
         e_p = dp - s.p[now] - _times(s.p_bg[now], gyro) - _times(s.p_ba[now], accel)
-        r = _times(s.whiten[now], np.concatenate([e_R, e_v, e_p], axis=1))
-        return r, e_R, R_ij, dv, dp
+        return np.concatenate([se3.so3_log(E), e_v, e_p], axis=1), E, R_ij, dv, dp
 
-    def _inertial(self, state: ChainState, first: int, last: int) -> tuple[Array, Array, Array]:
-        """Whitened Jacobians (B, 9, 15), (B, 9, 9) at the two frames, and right-hand side (B, 9)."""
+    def _inertial(self, state: ChainState, first: int, last: int, A: Array) -> None:
+        """Write the rows (B, 9, 27) of the inertial steps, not whitened; the places that stay zero must be zero."""
         s, now = self.steps, slice(first, last)
-        r, e_R, R_ij, dv, dp = self._residuals(state, first, last)
+        e, E, R_ij, dv, dp = self._residuals(state, first, last)
         R_t = np.swapaxes(state.R[now], 1, 2)
-        J = se3.so3_right_jacobian_inverse(e_R)
-        A_i, A_j = np.zeros((last - first, 9, 15)), np.zeros((last - first, 9, 9))
-        A_i[:, :3, ROTATION] = -J @ np.swapaxes(R_ij, 1, 2)
-        A_i[:, :3, GYRO_BIAS] = -J @ np.swapaxes(se3.so3_exp(e_R), 1, 2) @ s.R_bg[now]
-        A_j[:, :3, ROTATION] = J
-        A_i[:, 3:6, ROTATION] = se3.skew(dv)
-        A_i[:, 3:6, SPEED] = -R_t
-        A_i[:, 3:6, ACCEL_BIAS], A_i[:, 3:6, GYRO_BIAS] = -s.v_ba[now], -s.v_bg[now]
-        A_j[:, 3:6, SPEED] = R_t
-        A_i[:, 6:, ROTATION] = se3.skew(dp)
-        A_i[:, 6:, SHIFT] = -np.eye(3)
-        A_i[:, 6:, SPEED] = -R_t * (s.free_fall * s.dt_s)[now, None, None]
-        A_i[:, 6:, ACCEL_BIAS], A_i[:, 6:, GYRO_BIAS] = -s.p_ba[now], -s.p_bg[now]
-        A_j[:, 6:, SHIFT] = R_ij
-        W = s.whiten[now]
-        return W @ A_i, W @ A_j, -r
+        R_ji = np.swapaxes(state.R[first + 1:last + 1], 1, 2) @ state.R[now]
+        J = se3.so3_right_jacobian_inverse(e[:, :3])
+        A[:, :3, NEXT_ROTATION] = J
+        np.negative(J, out=J)
+        np.matmul(J, R_ji, out=A[:, :3, ROTATION])
+        np.matmul(J, np.swapaxes(E, 1, 2) @ s.R_bg[now], out=A[:, :3, GYRO_BIAS])
+        A[:, 3:6, NEXT_SPEED] = R_t
+        np.negative(R_t, out=A[:, 3:6, SPEED])
+        np.multiply(A[:, 3:6, SPEED], (s.free_fall[now] * s.dt_s[now])[:, None, None], out=A[:, 6:, SPEED])
+        for rows, moved, by_gyro, by_accel in ((slice(3, 6), dv, s.v_bg, s.v_ba), (slice(6, 9), dp, s.p_bg, s.p_ba)):
+            A[:, rows, ROTATION] = se3.skew(moved)
+            np.negative(by_gyro[now], out=A[:, rows, GYRO_BIAS])
+            np.negative(by_accel[now], out=A[:, rows, ACCEL_BIAS])
+        A[:, 6:, SHIFT] = -np.eye(3)
+        A[:, 6:, NEXT_SHIFT] = R_ij
+        np.negative(e, out=A[:, :, RIGHT])
 
     def _anchor_residuals(self, state: ChainState) -> tuple[Array, Array, Array]:
         """Whitened residuals of the first frame's pose, velocity and biases."""
@@ -171,22 +190,51 @@ class ChainModel:
         system.add_links(SCALE, information, wanted)
 
 
-def add_motions(system: ChainSystem, state: ChainState, term: MotionTerm, near: Indices | None = None) -> None:
-    """Add the relative motions, all or the `near` ones, with the weights of their loss."""
-    motions, log_scale = term.motions, term.log_scale(state)
-    groups = _groups(motions.i, motions.j) if near is None else \
-        [near[group] for group in _groups(motions.i[near], motions.j[near])]
-    for group in groups:
-        for first, last in spans(len(group), BLOCK_NODES):
-            n = group[first:last]
-            which = slice(int(n[0]), int(n[-1]) + 1) if n[-1] - n[0] == len(n) - 1 else n
-            blocks = term.blocks(state, which, log_scale)
-            root = np.sqrt(term.losses(blocks.squared_norm, which)[1])[:, None]
-            A_i, rows = blocks.A_i, POSE
-            if term.segment is not None:
-                A_i, rows = np.concatenate([blocks.A_s, A_i], axis=2), SCALE_AND_POSE
-            i, j = _ends(motions.i[which], motions.j[which], system.reach)
-            system.add(i, j, (rows, A_i * root[:, :, None]), (POSE, blocks.A_j * root[:, :, None]), blocks.b * root)
+class MotionRows:
+    """The motions that the band holds, as whitened rows with the weights of their loss.
+
+    Args:
+        state: where they are linearised.
+        term: the motions.
+        near: those that the band holds.
+    """
+
+    def __init__(self, state: ChainState, term: MotionTerm, near: Indices) -> None:
+        self.state, self.term, self._log_scale = state, term, term.log_scale(state)
+        i, j = term.motions.i[near], term.motions.j[near]
+        groups = [near[group] for group in _groups(i, j)]
+        self.groups = [group[np.argsort(term.motions.i[group], kind="stable")] for group in groups]
+        """Motions by first frame, no frame twice a first or twice a second one within a group."""
+        self._first = [term.motions.i[group] for group in self.groups]
+
+    def write(self, group: int, first: int, last: int, rows: Array) -> None:
+        """Write those of a group that start at frames `first` to `last` (exclusive) into those frames' rows."""
+        begin, end = np.searchsorted(self._first[group], [first, last])
+        at = self._first[group][begin:end] - first
+        self._write(self.groups[group][begin:end], rows, slice(0, len(at)) if len(at) == last - first else at)
+
+    def _write(self, n: Indices, rows: Array, at: slice | Indices) -> None:
+        if len(n) < len(rows):
+            rows[:, :MOTION_ROWS] = 0.0
+        if len(n) == 0:
+            return
+        which = slice(int(n[0]), int(n[-1]) + 1) if (np.diff(n) == 1).all() else n
+        blocks = self.term.blocks(self.state, which, self._log_scale)
+        root = np.sqrt(self.term.losses(blocks.squared_norm, which)[1])[:, None, None]
+        for columns, source in ((SCALE, slice(0, 1)), (POSE, slice(1, 7)), (NEXT_POSE, slice(7, 13)),
+                                (slice(RIGHT, RIGHT + 1), slice(13, 14))):
+            if columns != SCALE or self.term.segment is not None:
+                rows[at, :MOTION_ROWS, columns] = blocks.columns[:, :, source] * root
+
+    def add(self, system: ChainSystem) -> None:
+        """Add all to a system."""
+        motions = self.term.motions
+        for group in self.groups:
+            for first, last in spans(len(group), BLOCK_NODES):
+                n = group[first:last]
+                rows = np.zeros((len(n), MOTION_ROWS, RIGHT + 1))
+                self._write(n, rows, slice(0, len(n)))
+                system.add(motions.i[n], motions.j[n], rows)
 
 
 def far_factors(state: ChainState, term: MotionTerm, far: Indices) -> FarFactors:
@@ -199,19 +247,6 @@ def far_factors(state: ChainState, term: MotionTerm, far: Indices) -> FarFactors
         A_i[:, :, :1] = blocks.A_s
     return FarFactors(term.motions.i[far], term.motions.j[far], A_i * root[:, :, None], A_j * root[:, :, None],
                       blocks.b * root)
-
-
-def _ends(i: Indices, j: Indices, reach: int) -> tuple[Nodes, Nodes]:
-    """Frames of motions, as slices where these join one neighbour after the other."""
-    neighbours = (j - i == 1).all() and (np.diff(i) == 1).all()
-    return _pair(int(i[0]), int(j[-1]), reach) if neighbours else (i, j)
-
-
-def _pair(first: int, last: int, reach: int) -> tuple[Nodes, Nodes]:
-    """Frames `first` to `last` (exclusive) and their successors, as slices where frames make no blocks."""
-    if reach == 1:
-        return slice(first, last), slice(first + 1, last + 1)
-    return np.arange(first, last), np.arange(first + 1, last + 1)
 
 
 def _groups(i: Indices, j: Indices) -> list[Indices]:

@@ -86,11 +86,13 @@ def chain_start(problem: Problem, config: RefineConfig, log_scale: float,
     stretches: list[Stretch] = []
     anchors: list[Anchor] = []
     before: Anchor | None = None
+    memory = None
     for k0, keep, k1 in chunk_spans(len(problem) - 1, config.solver):
         model, guess, term = _chunk(problem, config, log_scale, steps.part(k0, k1), k0, before)
         anchors.append(model.anchor)
+        memory = model.system(term, memory)
         try:
-            solution = chain_gauss_newton(model, guess, term, CHUNK_ITERATIONS, CHUNK_TOLERANCE)
+            solution = chain_gauss_newton(model, guess, term, CHUNK_ITERATIONS, CHUNK_TOLERANCE, memory)
             state, chi2 = solution.values, imu_chi2(solution.native_cost, int(problem.imu_usable[k0:k1].sum()))
             stretches.append(Stretch(k0, keep, chi2))
         except EstimationError as error:

@@ -76,12 +76,10 @@ def gyro_chain(problem: Problem, R_steps: Array, first: int) -> Array:
     The measured motion's rotation stands in where the IMU is missing.
     """
     T = se3.transform(R_steps, np.zeros(3))
-    body = problem.motions.body_rotation()
-    consecutive = np.flatnonzero(problem.motions.j - problem.motions.i == 1)
-    for n in consecutive[~problem.imu_usable[problem.motions.i[consecutive]]]:
-        k = int(problem.motions.i[n]) - first
-        if 0 <= k < len(T):
-            T[k, :3, :3] = body[n]
+    m = problem.motions
+    instead = np.flatnonzero((m.j - m.i == 1) & (m.i >= first) & (m.i < first + len(T)))
+    instead = instead[~problem.imu_usable[m.i[instead]]]
+    T[m.i[instead] - first, :3, :3] = m.select(instead).body_rotation()
     return se3.chain(T)[:, :3, :3]
 
 

@@ -61,7 +61,9 @@ class NativeEngine:
         still = self._step(begin, term, blocks)
         found = []
         for error in errors:
-            moved = self._step(begin, term, replace(blocks, b=blocks.b + error))
+            columns = blocks.columns.copy()
+            columns[:, :, -1] += error
+            moved = self._step(begin, term, replace(blocks, columns=columns))
             found.append(Step(moved.pose - still.pose, moved.scale - still.scale))
         return found
 

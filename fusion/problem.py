@@ -11,7 +11,7 @@ from fusion.scaled_motion import ScaledMotions, make_motions
 from fusion.vibration import vibration_inflation
 from vio import se3
 from vio.errors import MotionsError
-from vio.imu import Gap, ImuNoise, ImuPieces, ImuSamples, find_gaps, preintegrate_rotation, split_at_frames
+from vio.imu import Gap, ImuNoise, ImuPieces, ImuSamples, find_gaps, gyro_rotations, split_at_frames
 from vio.imu_checks import check_imu, saturated_samples
 from vio.motions import RelativeMotions, match_frames
 from vio.recording import Recording, check_refinable
@@ -173,8 +173,7 @@ def _initial_gyro_bias(recording: Recording, motions: ScaledMotions, t: Array, u
     k = np.flatnonzero((surest >= 0) & usable)[:BIAS_FRAMES]
     if len(k) == 0:
         return np.zeros(3)
-    pieces = split_at_frames(recording.imu, recording.imu_t_s, t[:k[-1] + 2])
-    gyro = preintegrate_rotation(pieces, np.zeros(3))[k]
+    gyro = gyro_rotations(recording.imu, recording.imu_t_s, t[:k[-1] + 2])[k]
     off = se3.so3_log(np.swapaxes(motions.select(surest[k]).body_rotation(), 1, 2) @ gyro)
     bias: Array = np.median(off / np.diff(t)[k, None], axis=0)
     return bias

@@ -79,16 +79,30 @@ class ScaledMotions:
 class Linearized:
     """Whitened Gauss-Newton blocks of N motions around the current state."""
 
-    A_i: Array
-    """(N, 6, 6) with respect to pose i, right perturbation, rotation first."""
-    A_j: Array
-    """(N, 6, 6) with respect to pose j."""
-    A_s: Array
-    """(N, 6, 1) with respect to the log scale."""
-    b: Array
-    """(N, 6) right-hand side, minus the whitened residual."""
+    columns: Array
+    """(N, 6, 14) side by side: A_s, A_i, A_j and b."""
     squared_norm: Array
     """(N,) whitened residual squared, before any robust weight."""
+
+    @property
+    def A_s(self) -> Array:
+        """(N, 6, 1) with respect to the log scale."""
+        return self.columns[:, :, :1]
+
+    @property
+    def A_i(self) -> Array:
+        """(N, 6, 6) with respect to pose i, right perturbation, rotation first."""
+        return self.columns[:, :, 1:7]
+
+    @property
+    def A_j(self) -> Array:
+        """(N, 6, 6) with respect to pose j."""
+        return self.columns[:, :, 7:13]
+
+    @property
+    def b(self) -> Array:
+        """(N, 6) right-hand side, minus the whitened residual."""
+        return self.columns[:, :, 13]
 
 
 def make_motions(i: NDArray[np.int64], j: NDArray[np.int64], T_i_j: Array, cov: Array,
@@ -101,7 +115,8 @@ def make_motions(i: NDArray[np.int64], j: NDArray[np.int64], T_i_j: Array, cov: 
 def residuals(motions: ScaledMotions, R: Array, p: Array, log_scale: Array) -> Array:
     """Whitened residuals (N, 6) at body poses R (M, 3, 3), p (M, 3) and per-motion log scales (N,)."""
     R_pred, t_pred, _ = _predict(motions, R, p)
-    return _whitened(motions, R_pred, t_pred, np.exp(-log_scale))
+    e = _errors(np.swapaxes(motions.R, 1, 2), motions.t, R_pred, t_pred, np.exp(-log_scale))
+    return np.asarray((motions.whiten @ e[:, :, None])[:, :, 0])
 
 
 def linearize(motions: ScaledMotions, R: Array, p: Array, log_scale: Array) -> Linearized:
@@ -109,22 +124,22 @@ def linearize(motions: ScaledMotions, R: Array, p: Array, log_scale: Array) -> L
     R_bc, t_bc = motions.T_body_camera[:3, :3], motions.T_body_camera[:3, 3]
     inverse_scale = np.exp(-log_scale)
     R_pred, t_pred, (R_ij, t_ij) = _predict(motions, R, p)
-    r = _whitened(motions, R_pred, t_pred, inverse_scale)
-
     R_meas_t = np.swapaxes(motions.R, 1, 2)
-    J_inverse = se3.so3_right_jacobian_inverse(se3.so3_log(R_meas_t @ R_pred))
-    to_units = inverse_scale[:, None, None] * (R_meas_t @ R_bc.T)
-    n = len(motions)
-    D_i, D_j, D_s = np.zeros((n, 6, 6)), np.zeros((n, 6, 6)), np.zeros((n, 6, 1))
-    D_i[:, :3, :3] = -J_inverse @ np.swapaxes(R_bc @ R_pred, 1, 2)
-    D_j[:, :3, :3] = J_inverse @ R_bc.T
-    D_i[:, 3:, :3] = to_units @ se3.skew(t_ij + R_ij @ t_bc)
-    D_i[:, 3:, 3:] = -to_units
-    D_j[:, 3:, :3] = -to_units @ R_ij @ se3.skew(t_bc)
-    D_j[:, 3:, 3:] = to_units @ R_ij
-    D_s[:, 3:, 0] = -inverse_scale[:, None] * (R_meas_t @ t_pred[:, :, None])[:, :, 0]
-    W = motions.whiten
-    return Linearized(W @ D_i, W @ D_j, W @ D_s, -r, np.einsum("nk,nk->n", r, r))
+    e = _errors(R_meas_t, motions.t, R_pred, t_pred, inverse_scale)
+    J_inverse = se3.so3_right_jacobian_inverse(e[:, :3])
+    to_units = _times_constant(inverse_scale[:, None, None] * R_meas_t, R_bc.T)
+    D = np.zeros((len(motions), 6, 14))
+    D[:, 3:, 0] = -inverse_scale[:, None] * (R_meas_t @ t_pred[:, :, None])[:, :, 0]
+    D[:, :3, 7:10] = _times_constant(J_inverse, R_bc.T)
+    np.matmul(-J_inverse, np.swapaxes(R_pred, 1, 2) @ R_bc.T, out=D[:, :3, 1:4])
+    D[:, 3:, 1:4] = to_units @ se3.skew(t_ij + R_ij @ t_bc)
+    D[:, 3:, 4:7] = -to_units
+    R_units = to_units @ R_ij
+    D[:, 3:, 7:10] = _times_constant(R_units, -se3.skew(t_bc))
+    D[:, 3:, 10:13] = R_units
+    D[:, :, 13] = -e
+    columns = motions.whiten @ D
+    return Linearized(columns, np.einsum("nk,nk->n", columns[:, :, 13], columns[:, :, 13]))
 
 
 def _predict(motions: ScaledMotions, R: Array, p: Array) -> tuple[Array, Array, tuple[Array, Array]]:
@@ -134,12 +149,15 @@ def _predict(motions: ScaledMotions, R: Array, p: Array) -> tuple[Array, Array, 
     R_ij = R_i_t @ R[motions.j]
     t_ij = (R_i_t @ (p[motions.j] - p[motions.i])[:, :, None])[:, :, 0]
     t_pred = (t_ij + R_ij @ t_bc - t_bc) @ R_bc
-    return R_bc.T @ R_ij @ R_bc, t_pred, (R_ij, t_ij)
+    return _times_constant(R_bc.T @ R_ij, R_bc), t_pred, (R_ij, t_ij)
 
 
-def _whitened(motions: ScaledMotions, R_pred: Array, t_pred: Array, inverse_scale: Array) -> Array:
-    R_meas_t = np.swapaxes(motions.R, 1, 2)
-    e_R = se3.so3_log(R_meas_t @ R_pred)
-    e_t = (R_meas_t @ (inverse_scale[:, None] * t_pred - motions.t)[:, :, None])[:, :, 0]
-    whitened: Array = (motions.whiten @ np.concatenate([e_R, e_t], axis=1)[:, :, None])[:, :, 0]
-    return whitened
+def _times_constant(A: Array, constant: Array) -> Array:
+    """Matrices (N, 3, 3) times one (3, 3), as one long product."""
+    return np.asarray((A.reshape(-1, 3) @ constant).reshape(-1, 3, 3))
+
+
+def _errors(R_meas_t: Array, t_meas: Array, R_pred: Array, t_pred: Array, inverse_scale: Array) -> Array:
+    """(N, 6) e_R and e_t."""
+    e_t = (R_meas_t @ (inverse_scale[:, None] * t_pred - t_meas)[:, :, None])[:, :, 0]
+    return np.concatenate([se3.so3_log(R_meas_t @ R_pred), e_t], axis=1)

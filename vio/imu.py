@@ -141,28 +141,39 @@ def split_at_frames(samples: ImuSamples, imu_t_s: ArrayLike, frame_t_s: ArrayLik
         ImuError: the samples do not reach over all frames.
     """
     t, frames = np.asarray(imu_t_s, float), np.asarray(frame_t_s, float)
-    check_coverage(t, frames)
-    middle = 0.5 * (t[1:] + t[:-1])
-    inner = middle[(middle > frames[0]) & (middle < frames[-1])]
-    cuts = np.union1d(inner, frames)
-    start, dt = cuts[:-1], np.diff(cuts)
-    owner = np.searchsorted(middle, start + 0.5 * dt)
-    keep = dt > 1e-9  # stamps and frames closer than a nanosecond are the same instant
-    start, dt, owner = start[keep], dt[keep], owner[keep]
-    interval = np.searchsorted(frames, start + 0.5 * dt) - 1
+    dt, owner, offset, interval = _cut_cells(t, frames)
     m = len(frames) - 1
-    length = np.bincount(interval, weights=dt, minlength=m)
-    dt = dt * (np.diff(frames) / length)[interval]
-    offset = (start + 0.5 * dt - t[owner])[:, None]
     gyro = samples.gyro_rad_s[owner] + offset * _slope(samples.gyro_rad_s, t)[owner]
-    force = samples.accel_m_s2[owner] + offset * _slope(samples.accel_m_s2, t)[owner]
+    slope = _slope(samples.accel_m_s2, t)[owner]
+    force = samples.accel_m_s2[owner] + offset * slope
     rate = gyro - np.asarray(gyro_bias_rad_s)
     turn = se3.so3_exp(rate * (0.5 * dt)[:, None])
     accel = (turn @ force[:, :, None])[:, :, 0]
-    jerk = (turn @ (_slope(samples.accel_m_s2, t)[owner] + np.cross(rate, force))[:, :, None])[:, :, 0]
+    jerk = (turn @ (slope + np.cross(rate, force))[:, :, None])[:, :, 0]
     accel = accel + _slopes_as_constants(jerk, dt, interval, m)
     first = np.searchsorted(interval, np.arange(m + 1))
     return ImuPieces(gyro, accel, dt, first.astype(np.int64), _longest_spacing(t, frames))
+
+
+def _cut_cells(t: Array, frames: Array) -> tuple[Array, NDArray[np.int64], Array, NDArray[np.int64]]:
+    """Cells of samples at t (N,) cut at frames (M+1,): P pieces' lengths, samples, centres after those, intervals.
+
+    Raises:
+        ImuError: the samples do not reach over all frames.
+    """
+    check_coverage(t, frames)
+    middle = 0.5 * (t[1:] + t[:-1])
+    inner = middle[np.searchsorted(middle, frames[0], "right"):np.searchsorted(middle, frames[-1], "left")]
+    place = np.searchsorted(inner, frames, "left")
+    cuts = np.insert(inner, place, frames)
+    start, dt = cuts[:-1], np.diff(cuts)
+    keep = dt > 1e-9  # stamps and frames closer than a nanosecond are the same instant
+    start, dt = start[keep], dt[keep]
+    owner = np.searchsorted(middle, start + 0.5 * dt)
+    interval = np.searchsorted(frames, start + 0.5 * dt) - 1
+    length = np.bincount(interval, weights=dt, minlength=len(frames) - 1)
+    dt = dt * (np.diff(frames) / length)[interval]
+    return dt, owner, (start + 0.5 * dt - t[owner])[:, None], interval
 
 
 def _slopes_as_constants(jerk: Array, dt: Array, interval: NDArray[np.int64], intervals: int) -> Array:
@@ -210,13 +221,39 @@ def _longest_spacing(t: Array, frames: Array) -> Array:
     return np.maximum.reduceat(padded, edges)[::2]
 
 
+def gyro_rotations(samples: ImuSamples, imu_t_s: ArrayLike, frame_t_s: ArrayLike,
+                   gyro_bias_rad_s: ArrayLike = (0.0, 0.0, 0.0)) -> Array:
+    """Gyro rotation (M, 3, 3) from each frame to the next: `preintegrate_rotation` of `split_at_frames`, less work.
+
+    Args:
+        samples: N samples.
+        imu_t_s: (N,) their stamps on the frames' clock [s], strictly increasing.
+        frame_t_s: (M+1,) frame times [s], strictly increasing, covered by the samples.
+        gyro_bias_rad_s: (3,) removed.
+
+    Raises:
+        ImuError: the samples do not reach over all frames.
+    """
+    t, frames = np.asarray(imu_t_s, float), np.asarray(frame_t_s, float)
+    dt, owner, offset, interval = _cut_cells(t, frames)
+    gyro = samples.gyro_rad_s[owner] + offset * _slope(samples.gyro_rad_s, t)[owner]
+    return _rotations(gyro - np.asarray(gyro_bias_rad_s), dt, np.searchsorted(interval, np.arange(len(frames))))
+
+
 def preintegrate_rotation(pieces: ImuPieces, gyro_bias_rad_s: ArrayLike) -> Array:
     """Gyro rotation (M, 3, 3) from each frame to the next, `R_body_k_body_k1`, with a constant bias removed."""
-    bias = np.asarray(gyro_bias_rad_s, float)
-    steps = se3.so3_exp((pieces.gyro_rad_s - bias) * pieces.dt_s[:, None])
-    counts = np.diff(pieces.first)
+    return _rotations(pieces.gyro_rad_s - np.asarray(gyro_bias_rad_s, float), pieces.dt_s, pieces.first)
+
+
+def _rotations(rate: Array, dt: Array, first: NDArray[np.int64]) -> Array:
+    """Products (M, 3, 3) of the turns by pieces at rates (P, 3), interval k's from `first[k]` to `first[k+1]`."""
+    steps = se3.so3_exp(rate * dt[:, None])
+    counts = np.diff(first)
     out = np.broadcast_to(np.eye(3), (len(counts), 3, 3)).copy()
     for offset in range(int(counts.max(initial=0))):
-        active = counts > offset
-        out[active] = out[active] @ steps[pieces.first[:-1][active] + offset]
+        if (counts > offset).all():
+            out = out @ steps[first[:-1] + offset]
+        else:
+            active = counts > offset
+            out[active] = out[active] @ steps[first[:-1][active] + offset]
     return out

@@ -187,9 +187,12 @@ def chain_motions(motions: RelativeMotions, frame_t_s: ArrayLike, T_body_camera:
     steps = np.broadcast_to(np.eye(4), (len(frames) - 1, 4, 4)).copy()
     measured = np.zeros(len(frames) - 1, bool)
     certainty = np.trace(motions.cov, axis1=1, axis2=2)
-    for n in np.lexsort((certainty, j - i)):  # short before wide, certain before uncertain
+    order = np.lexsort((certainty, j - i))  # short before wide, certain before uncertain
+    neighbours = order[(j - i)[order] == 1][::-1]  # the last written is the most certain
+    steps[i[neighbours]], measured[i[neighbours]] = body[neighbours], True
+    for n in order[len(neighbours):]:
         span = slice(i[n], j[n])
         if not measured[span].any():
-            steps[span] = se3.exp(se3.log(body[n]) / (j[n] - i[n])) if j[n] - i[n] > 1 else body[n]
+            steps[span] = se3.exp(se3.log(body[n]) / (j[n] - i[n]))
             measured[span] = True
     return Trajectory(frames, se3.chain(steps, T_world_first)), int((~measured).sum())

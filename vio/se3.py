@@ -68,24 +68,30 @@ def _jacobian_coefficients(angle: Array) -> tuple[Array, Array]:
 def so3_right_jacobian(rotvec: ArrayLike) -> Array:
     """J_r with `Exp(w + d) ≈ Exp(w) Exp(J_r(w) d)`, shape (..., 3, 3)."""
     w = np.asarray(rotvec, float)
-    first, second = _jacobian_coefficients(np.linalg.norm(w, axis=-1)[..., None, None])
-    K = skew(w)
-    J: Array = np.eye(3) - first * K + second * (K @ K)
-    return J
+    squared = np.einsum("...k,...k->...", w, w)
+    first, second = _jacobian_coefficients(np.sqrt(squared))
+    return _about(w, squared, -first, second)
+
+
+def _about(w: Array, squared: Array, a: Array, b: Array) -> Array:
+    """1 + a K + b K² with K = skew(w), K² = w wᵀ - |w|² 1, and |w|² given."""
+    out: Array = skew(a[..., None] * w)
+    out += (b[..., None] * w)[..., :, None] * w[..., None, :]
+    for k in range(3):
+        out[..., k, k] += 1.0 - b * squared
+    return out
 
 
 def so3_right_jacobian_inverse(rotvec: ArrayLike) -> Array:
     """Inverse of `so3_right_jacobian`, finite for |w| < 2 pi, shape (..., 3, 3)."""
     w = np.asarray(rotvec, float)
-    angle = np.linalg.norm(w, axis=-1)[..., None, None]
+    squared = np.einsum("...k,...k->...", w, w)
+    angle = np.sqrt(squared)
     small = angle < 1e-2
     a = np.where(small, 1.0, angle)
     half = 0.5 * a
-    series = 1 / 12 + angle**2 / 720
-    coefficient = np.where(small, series, (1 - half / np.tan(half)) / a**2)
-    K = skew(w)
-    J: Array = np.eye(3) + 0.5 * K + coefficient * (K @ K)
-    return J
+    coefficient = np.where(small, 1 / 12 + squared / 720, (1 - half / np.tan(half)) / a**2)
+    return _about(w, squared, np.full_like(angle, 0.5), coefficient)
 
 
 def transform(R: ArrayLike, t: ArrayLike) -> Array:
@@ -142,17 +148,25 @@ def interpolate(T_w_a: ArrayLike, T_w_b: ArrayLike, fraction: ArrayLike) -> Arra
 def chain(T_k_k1: ArrayLike, T_first: ArrayLike | None = None) -> Array:
     """Poses (N+1, 4, 4) of N consecutive relative motions (N, 4, 4), starting at `T_first`.
 
-    A parallel prefix product: log2(N) batched passes instead of a Python loop. Rotations are
-    brought back onto SO(3) after every pass, so 100,000 products stay orthonormal.
+    Stretches of about sqrt(N) motions are chained side by side, and then onto each other. Rotations are brought back
+    onto SO(3) at the end of every stretch, so 100,000 products stay orthonormal.
     """
     steps = np.asarray(T_k_k1, float)
     first = np.eye(4) if T_first is None else np.asarray(T_first, float)
     T = np.concatenate([first[None], steps])
-    shift = 1
-    while shift < len(T):
-        T[shift:] = T[:-shift] @ T[shift:]
-        T[:, :3, :3] = _rotation(T[:, :3, :3]).as_matrix()
-        shift *= 2
+    size = int(np.ceil(np.sqrt(len(T))))
+    stretches = -(-len(T) // size)
+    inside = np.broadcast_to(np.eye(4), (stretches * size, 4, 4)).copy()
+    inside[:len(T)] = T
+    inside = inside.reshape(stretches, size, 4, 4)
+    for k in range(1, size):
+        inside[:, k] = inside[:, k - 1] @ inside[:, k]
+    for k in range(1, stretches):
+        begin = inside[k - 1, -1]
+        begin[:3, :3] = _rotation(begin[:3, :3]).as_matrix()
+        inside[k] = begin @ inside[k]
+    T = inside.reshape(-1, 4, 4)[:len(T)]
+    T[:, :3, :3] = _rotation(T[:, :3, :3]).as_matrix()
     return T
 
 

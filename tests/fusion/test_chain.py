@@ -155,6 +155,12 @@ def test_a_chain_ends_where_gtsam_ends(short, problem, case):
 @given(seed=st.integers(0, 1000), nodes=st.integers(2, 23), reach=st.integers(1, 4), stops=st.integers(2, 9),
        loops=st.integers(0, 13))
 def test_solution_and_marginals_equal_dense_algebra(seed, nodes, reach, stops, loops):
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(chain, "CHAIN_NODES", 5)
+        check_against_dense_algebra(seed, nodes, reach, stops, loops)
+
+
+def check_against_dense_algebra(seed, nodes, reach, stops, loops):
     rng = np.random.default_rng(seed)
     system = ChainSystem(nodes, reach)
     dense, gradient = np.zeros(2 * [nodes * DIM]), np.zeros(nodes * DIM)
@@ -162,8 +168,11 @@ def test_solution_and_marginals_equal_dense_algebra(seed, nodes, reach, stops, l
         i = np.arange(nodes - span)
         A_i, A_j = rng.standard_normal((len(i), 9, DIM)), rng.standard_normal((len(i), 9, 10))
         b = rng.random((len(i), 9))
-        pair = (slice(0, nodes - 1), slice(1, nodes)) if reach == 1 else (i, i + span)
-        system.add(*pair, (slice(0, DIM), A_i), (slice(0, 10), A_j), b)
+        rows = np.concatenate([A_i, A_j, b[:, :, None]], axis=2)
+        if reach == 1:
+            system.add_chain(0, rows)
+        else:
+            system.add(i, i + span, rows)
         for k in i:
             A = np.zeros((9, nodes * DIM))
             A[:, k * DIM:(k + 1) * DIM], A[:, (k + span) * DIM:(k + span) * DIM + 10] = A_i[k], A_j[k]
@@ -214,7 +223,7 @@ def test_samples_hang_together_as_dense_algebra_has_it():
     system = ChainSystem(nodes, 1)
     i = np.arange(nodes - 1)
     A_i, A_j = rng.standard_normal((nodes - 1, 9, DIM)), rng.standard_normal((nodes - 1, 9, 10))
-    system.add(slice(0, nodes - 1), slice(1, nodes), (slice(0, DIM), A_i), (slice(0, 10), A_j), rng.random((5, 9)))
+    system.add_chain(0, np.concatenate([A_i, A_j, rng.random((5, 9, 1))], axis=2))
     for c in range(DIM):
         system.add_everywhere(c, 0.5)
     dense = 0.5 * np.eye(nodes * DIM)

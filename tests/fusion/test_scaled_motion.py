@@ -62,7 +62,7 @@ def test_jacobians_are_the_derivatives(seed, angle, error_angle, log_scale):
     T, motions, _ = random_setup(seed, angle, error_angle, log_scale)
     blocks = linearize(motions, T[:, :3, :3], T[:, :3, 3], np.full(len(motions), log_scale))
     r = residuals_at(motions, T, log_scale)
-    np.testing.assert_array_equal(blocks.b, -r)
+    np.testing.assert_allclose(blocks.b, -r, rtol=1e-12, atol=1e-12)
     np.testing.assert_allclose(blocks.squared_norm, (r**2).sum(axis=1))
 
     h = np.repeat([1e-5, 1e-6], 3)
