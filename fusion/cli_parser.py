@@ -136,6 +136,8 @@ def _train(commands: Commands) -> None:
     parser.add_argument("--patience", type=int, metavar="N", help="stop after N validations without a better loss")
     parser.add_argument("--device", choices=("cpu", "cuda"), help="default: cuda where there is one")
     parser.add_argument("--config", type=Path, metavar="c.yaml", help="any decision of `learned.train_config`")
+    parser.add_argument("--start-from", type=Path, metavar="W", help="weights of the same method to begin with; "
+                        "default: drawn from the seed")
     parser.add_argument("--refined", type=Path, nargs="+", metavar="RUN",
                         help="what `refine` made of the recordings, in their order: where the accelerometer measured "
                              "scale, lengths of steps teach the network how deep things are")

@@ -25,9 +25,8 @@ from fusion.solve import MotionTerm
 
 Array = NDArray[np.float64]
 
-DRAWS = SAMPLES
 AT_ONCE = 10
-"""Draws that are solved for together: what memory holds for a whole examination."""
+"""Draws that are made and solved for together: what memory holds for a whole examination."""
 
 
 def with_lasting_errors(engine: Engine, begin: Begin, term: MotionTerm, problem: Problem, segments: Segments | None,
@@ -47,23 +46,22 @@ def with_lasting_errors(engine: Engine, begin: Begin, term: MotionTerm, problem:
         EstimationError: the linear system has no unique solution.
     """
     blocks = linearize(term.motions, *read_poses(begin.values), term.log_scale(begin.values))
-    errors = lasting_errors(problem.t_s[term.motions.i], problem.error_correlation_s, DRAWS, rng)
+    t_s = problem.t_s[term.motions.i]
     cov, variance, joint = unsure.cov.copy(), unsure.log_scale_variance.copy(), unsure.joint
-    xi, log_scale = (None, None) if joint is None else (joint.xi.copy(), joint.log_scale.copy())
-    for first in range(0, DRAWS, AT_ONCE):
-        steps = engine.responses(begin, term, blocks, errors[first:first + AT_ONCE])
-        for draw, step in enumerate(steps, first):
-            cov += step.pose[:, :, None] * step.pose[:, None, :] / DRAWS
+    if joint is not None:
+        joint = JointSamples(joint.node, joint.xi.copy(), joint.log_scale.copy())
+    for first in range(0, SAMPLES, AT_ONCE):
+        errors = lasting_errors(t_s, problem.error_correlation_s, min(AT_ONCE, SAMPLES - first), rng)
+        for draw, step in enumerate(engine.responses(begin, term, blocks, errors), first):
+            cov += step.pose[:, :, None] * step.pose[:, None, :] / SAMPLES
             of_segment = np.zeros(len(variance))
             if term.segment is not None:
                 of_segment[term.segment] = step.scale
-                variance += of_segment**2 / DRAWS
-            if joint is not None and xi is not None and log_scale is not None:
-                xi[draw] += step.pose[joint.node]
+                variance += of_segment**2 / SAMPLES
+            if joint is not None:
+                joint.xi[draw] += step.pose[joint.node]
                 if segments is not None:
-                    log_scale[draw] += of_segment[segments.of_node[joint.node]]
-    if joint is not None and xi is not None and log_scale is not None:
-        joint = JointSamples(joint.node, xi, log_scale)
+                    joint.log_scale[draw] += of_segment[segments.of_node[joint.node]]
     return Uncertainty(cov, variance, joint)
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +17,7 @@ from learned.train_config import (
     train_config,
 )
 from learned.training import train
-from learned.weights import save_weights
+from learned.weights import load_weights, save_weights
 from vio.calibration import load_yaml
 from vio.errors import ConfigError
 from vio.recording import Recording
@@ -44,10 +43,9 @@ def run_training(recordings: Sequence[Recording], calibrate_on: Sequence[Recordi
     Raises:
         VioError: options, recordings or a checkpoint that do not fit, see `learned.training.train`.
     """
-    config = config_of(options)
-    if taught_by is not None and not config.needs_lengths:
-        config = replace(config, **MEASURED_LENGTHS)
-    run = train(recordings, config, options["out"], device=options.get("device"), progress=progress,
+    config = config_of(options, taught=taught_by is not None)
+    start = None if options.get("start_from") is None else load_weights(options["start_from"]).method.state_dict()
+    run = train(recordings, config, options["out"], device=options.get("device"), progress=progress, start_from=start,
                 trajectories=taught_by)
     path = Path(options["out"]) / WEIGHTS
     done = f"{path}: {run.step} steps, validation loss {run.validation.get('loss', float('nan')):.4f}"
@@ -60,8 +58,12 @@ def run_training(recordings: Sequence[Recording], calibrate_on: Sequence[Recordi
     return f"{done}; NEES {card['calibration']['nees']:.2f} over {card['calibration']['pairs']} calibration pairs"
 
 
-def config_of(options: Mapping[str, Any]) -> TrainConfig:
+def config_of(options: Mapping[str, Any], taught: bool = False) -> TrainConfig:
     """The decisions that the command line and its file of decisions make.
+
+    Args:
+        options: of the command line, by name.
+        taught: refined trajectories are given; lengths come from them unless the file decides otherwise.
 
     Raises:
         ConfigError: an unknown decision, or a value outside its range.
@@ -78,5 +80,6 @@ def config_of(options: Mapping[str, Any]) -> TrainConfig:
         if "method" in decided:
             raise ConfigError(f"{Path(options['config']).name}: the method is decided by --method and its options; "
                               "leave it out")
+    decided = (MEASURED_LENGTHS if taught else {}) | decided
     decided |= {key: options[key] for key in DIRECT if options.get(key) is not None}
     return train_config(method, **decided)

@@ -20,23 +20,12 @@ from learned.training_source import SourceSettings
 from vio import se3
 from vio.camera import Camera
 from vio.errors import ConfigError, TrajectoryError, UsageError
-from vio.formats.asl import read_asl
 from vio.formats.tum import write_tum
 from vio.trajectory import Trajectory
 
 CAMERA = Camera("pinhole", 64, 64, 42, 44, 30.5, 33.0)
 SMALL = SourceSettings(height=32, width=32)
 UNIT_M = 0.02
-
-
-@pytest.fixture(scope="module")
-def folder(tmp_path_factory):
-    return tmp_path_factory.mktemp("recording")
-
-
-@pytest.fixture
-def ball(folder, written):
-    return read_asl(folder / "ball") if (folder / "ball").is_dir() else written(folder, CAMERA)
 
 
 def tiny(**options):
@@ -162,15 +151,27 @@ def test_only_runs_with_measured_scale_teach(ball, tmp_path):
             teaching_trajectories([ball, ball], runs)
 
 
-def test_the_command_line_teaches(ball, folder, tmp_path, capsys):
-    free = run_folder(tmp_path / "free", ball.truth, "free")
-    out = tmp_path / "out"
-    command = ["train", str(folder / "ball"), "--width", "0.125", "--image-size", "64", "64", "--steps", "1",
-               "--batch-size", "2", "--device", "cpu", "--out", str(out), "--calibrate", str(folder / "ball"),
-               "--refined", str(free)]
-    main(command)
-    assert json.loads((out / "config.json").read_text())["length_from"] == "refined"
-    assert "step_lengths" in (out / "train.csv").read_text().splitlines()[0]
+def test_the_command_line_teaches_and_goes_on_from_weights(written, tmp_path, capsys):
+    film = written(tmp_path, CAMERA)
+    free = run_folder(tmp_path / "free", film.truth, "free")
+    chosen = tmp_path / "c.yaml"
+    chosen.write_text("unit_depth_weight: 0.07\nprecision: float32\n")
+    command = ["train", str(tmp_path / "ball"), "--width", "0.125", "--image-size", "64", "64", "--steps", "1",
+               "--batch-size", "2", "--device", "cpu", "--config", str(chosen), "--refined", str(free)]
+
+    def trained(name: str, *more: str) -> torch.Tensor:
+        out = tmp_path / name
+        main([*command, "--out", str(out), *more])
+        decided = json.loads((out / "config.json").read_text())
+        assert decided["length_from"] == "refined" and decided["unit_depth_weight"] == 0.07
+        assert "step_lengths" in (out / "train.csv").read_text().splitlines()[0]
+        stem: torch.Tensor = torch.load(out / "checkpoint.pt", weights_only=True)["model"]["depth.encoder.conv1.weight"]
+        return stem
+
+    first = trained("one")
+    seeded, went_on = (trained(f"two{len(more)}", "--seed", "9", *more)
+                       for more in ((), ("--start-from", str(tmp_path / "one" / "weights.safetensors"))))
+    assert (went_on - first).abs().max() < 0.01 < 0.1 < (seeded - first).abs().max()
     capsys.readouterr()
-    assert main([*command, str(free)]) == UsageError("").exit_code
+    assert main([*command, str(free), "--out", str(tmp_path / "three")]) == UsageError("").exit_code
     assert "2 runs for 1 recordings" in capsys.readouterr().err
