@@ -81,10 +81,14 @@ def lasting_errors(t_s: Array, correlation_s: float, draws: int, rng: np.random.
 def first_order(t_s: Array, correlation_s: float, white: Array) -> Array:
     """A first-order process of unit variance at times t_s (N,), in any order, driven by white noise (S, N, c)."""
     order = np.argsort(t_s, kind="stable")
-    process = white[:, order]
-    for k, rho in enumerate(np.exp(-np.diff(t_s[order]) / correlation_s)):
-        process[:, k + 1] = rho * process[:, k] + np.sqrt(1 - rho**2) * process[:, k + 1]
-    return np.asarray(process[:, np.argsort(order)])
+    kept = np.exp(-np.diff(t_s[order]) / correlation_s)
+    process = np.ascontiguousarray(np.moveaxis(white[:, order], 1, 0))  # one motion's numbers lie together
+    process[1:] *= np.sqrt(1 - kept**2)[:, None, None]
+    for before, after, rho in zip(process[:-1], process[1:], kept, strict=True):
+        after += rho * before
+    out = np.empty_like(white)
+    out[:, order] = np.moveaxis(process, 0, 1)
+    return out
 
 
 def lasting(problem: Problem) -> Callable[[Array], Array] | None:
