@@ -27,10 +27,11 @@ from learned.losses.appearance_flow import (
 )
 from learned.losses.consistency import ENDOSFM, MEASURED, PAPER, Consistency, consistency_loss
 from learned.losses.masks import visible_from
+from learned.losses.nearness import nearness_difference, search_nearness
 from learned.losses.priors import depth_like_light, rotation_from_gyro
 from learned.losses.resolution_adaptive import ResolutionAdaptive, resolution_adaptive_loss, scale_views
 from learned.losses.snippet import Snippet, both_directions
-from learned.losses.step_lengths import length_difference, with_length
+from learned.losses.step_lengths import length_difference, told_by, with_length
 from learned.losses.terms import LossTerms
 from learned.methods import Method, MethodOutput, snr_summary
 from learned.train_config import TrainConfig
@@ -59,6 +60,9 @@ class Objective(nn.Module):
         if config.needs_lengths and self._motion_loss() != self._consistency:
             raise ConfigError(f"training: refined lengths do not go with the loss of {config.method.name}; take "
                               "loss='paper', or length_from='network' and length_weight=0")
+        if config.nearness_weight and (config.length_from != "refined" or method.depth.nearness is None):
+            raise ConfigError("training: nearness_weight needs steps of known length (length_from='refined') and a "
+                              "depth network with one number per image (whole_image); set it to 0, or give both")
 
     def train(self, mode: bool = True) -> Objective:
         """Train or eval mode; frozen batch norms stay in eval mode."""
@@ -119,12 +123,16 @@ class Objective(nn.Module):
             in_warp = {pair: with_length(T, batch.step_m[:, min(pair)], unit_m) for pair, T in in_warp.items()}
         usable = batch.usable[:, None].expand(-1, 3, -1, -1, -1)
         snippet = Snippet(batch.images, depth, in_warp, batch.cameras, usable)
-        terms = consistency_loss(snippet, self._consistency_settings(batch))
+        settings = self._consistency_settings(batch)
+        terms = consistency_loss(snippet, settings)
         parts = dict(terms.parts) | _snr(out) | {"gyro_rotation": rotation.detach(), "step_length": _length(motions)}
         total = terms.total + self.config.rotation_weight * rotation
         if self.config.length_weight:
             apart = self._length_loss(motions, depth, batch)
             total, parts["step_lengths"] = total + self.config.length_weight * apart, apart.detach()
+        if self.config.nearness_weight:
+            apart, parts["nearness_found"] = self._nearness_loss(snippet, out, batch, settings)
+            total, parts["nearness"] = total + self.config.nearness_weight * apart, apart.detach()
         share = 1 - step / self.config.light_start_steps if self.config.light_start_steps else 0.0
         if share > 0 and self.training:
             light = depth_like_light(depth.flatten(0, 1), batch.images.flatten(0, 1))
@@ -161,6 +169,14 @@ class Objective(nn.Module):
         return length_difference(torch.cat([motions[pair] for pair in pairs]),
                                  torch.cat([batch.step_m[:, min(pair)] for pair in pairs]),
                                  self.config.length_unit_m, depth_i)
+
+    def _nearness_loss(self, snippet: Snippet, out: MethodOutput, batch: TripletBatch, settings: Consistency
+                       ) -> tuple[Tensor, Tensor]:
+        """How far the images' nearness is from what a search finds, and the mean weight of what it found."""
+        numbers = [out.depth[k].nearness for k in FRAMES]
+        told = told_by(batch.step_m)
+        found = search_nearness(snippet, {pair: told[:, min(pair)] for pair in snippet.motions}, settings)
+        return nearness_difference(torch.stack([x for x in numbers if x is not None], 1), found), found.weight.mean()
 
     def _resolution_adaptive(self, batch: TripletBatch, step: int) -> LossTerms:
         generator = torch.Generator().manual_seed(1_000_003 * self.config.seed + step)

@@ -64,6 +64,8 @@ class TrainConfig:
     """Metres that one motion unit stands for where lengths are refined."""
     length_weight: float = 0.0
     """Of the distance of the network's log step lengths from the refined ones."""
+    nearness_weight: float = 0.0
+    """Of how far the number per image that tells nearness is from what a search with steps of known length finds."""
     light_start_steps: int = 0
     """Steps over which a pull of depth towards luminance^-1/2 fades out."""
     depth_kind: DepthKind = "z"
@@ -105,7 +107,7 @@ class TrainConfig:
             if getattr(self, name) < 1:
                 raise ConfigError(f"training: {name} is {getattr(self, name)}, must be at least 1")
         for name in ("warm_up_steps", "clip_norm", "rotation_weight", "unit_depth_weight", "light_start_steps",
-                     "workers", "keep_every", "patience", "seed", "length_weight"):
+                     "workers", "keep_every", "patience", "seed", "length_weight", "nearness_weight"):
             if not getattr(self, name) >= 0:
                 raise ConfigError(f"training: {name} is {getattr(self, name)}, must not be negative")
         if not self.length_unit_m > 0:

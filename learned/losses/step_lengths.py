@@ -29,6 +29,13 @@ def with_length(T_i_j: Tensor, step_m: Tensor, unit_m: float) -> Tensor:
     return out
 
 
+def told_by(step_m: Tensor) -> Tensor:
+    """How much steps of known lengths (any shape) [m] can tell: 0..1, 0 where none is known."""
+    known = torch.isfinite(step_m)
+    length = torch.where(known, step_m, 0.0)
+    return length**2 / (length**2 + ROUNDING_M**2)
+
+
 def length_difference(T_i_j: Tensor, step_m: Tensor, unit_m: float, depth_i: Tensor | None) -> Tensor:
     """Weighted mean |log ratio| of the network's lengths to the known ones.
 
@@ -45,7 +52,7 @@ def length_difference(T_i_j: Tensor, step_m: Tensor, unit_m: float, depth_i: Ten
         step = step * (nearness.detach() - nearness).exp()
     known = torch.isfinite(step_m) & (step.detach() > SHORTEST)
     length = torch.where(known, step_m.to(step.dtype), 1.0)
-    weight = torch.where(known, length**2 / (length**2 + ROUNDING_M**2), 0.0)
+    weight = torch.where(known, told_by(length), 0.0)
     found = torch.where(known, step, 1.0).log()
     wanted = (length / unit_m).clamp(min=1e-6).log()
     return (weight * (found - wanted).abs()).sum() / weight.sum().clamp(min=1e-6)

@@ -106,12 +106,13 @@ class Method(nn.Module):
             return {}, {}
         count = (len(frames), len(wanted))
         chosen = None if features is None else features[:, list(wanted)].flatten(0, 1)
-        disparity, snr = self.depth(frames[:, list(wanted)].flatten(0, 1), chosen)
+        disparity, snr, nearness = self.depth(frames[:, list(wanted)].flatten(0, 1), chosen)
         scales = [torch.unflatten(x, 0, count) for x in disparity]
         depth = {}
         for n, k in enumerate(wanted):
             of_frame = tuple(x[:, n] for x in scales)
-            depth[k] = DepthPyramid(of_frame, tuple(self.config.depth_range.depth(x) for x in of_frame))
+            nearer = None if nearness is None else torch.unflatten(nearness, 0, count)[:, n]
+            depth[k] = DepthPyramid(of_frame, tuple(self.config.depth_range.depth(x) for x in of_frame), nearer)
         snrs = {} if snr is None else {k: torch.unflatten(snr, 0, count)[:, n] for n, k in enumerate(wanted)}
         return depth, snrs
 

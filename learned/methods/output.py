@@ -16,6 +16,8 @@ class DepthPyramid:
     """(B, 1, h, w) each, in 0..1: what the published losses smooth and compare."""
     depth: tuple[Tensor, ...]
     """(B, 1, h, w) each, z-depth in motion units."""
+    nearness: Tensor | None = None
+    """(B,) the number that brings everything in the image nearer, for a method that tells one."""
 
 
 @dataclass(frozen=True)

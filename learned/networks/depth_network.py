@@ -35,8 +35,9 @@ class DepthNetwork(nn.Module):
         """Fuse vibration of `vibration_features` numbers after every block of the encoder."""
         self.fusion = EncoderFusion(config, self.encoder.channels, vibration_features)
 
-    def forward(self, images: Tensor, vibration: Tensor | None) -> tuple[tuple[Tensor, ...], Tensor | None]:
-        """Disparity of every scale, finest first, (N, 1, h, w) in 0..1, and SNR (N, blocks).
+    def forward(self, images: Tensor, vibration: Tensor | None
+                ) -> tuple[tuple[Tensor, ...], Tensor | None, Tensor | None]:
+        """Disparity of every scale, finest first, (N, 1, h, w) in 0..1; SNR (N, blocks); the whole image's number (N,).
 
         Args:
             images: (N, 3, H, W) in 0..1.
@@ -46,18 +47,18 @@ class DepthNetwork(nn.Module):
         maps = self.encoder(images) if bound is None else self.encoder(images, bound)
         raw = tuple(x.float() if x.dtype in (torch.float16, torch.bfloat16) else x for x in self.decoder(maps))
         snr = None if bound is None else bound.snr
-        if self.nearness is not None:
-            nearer = self._nearness(maps)
-            raw = tuple(x + nearer for x in raw)
+        nearer = None if self.nearness is None else self._nearness(maps)
+        if nearer is not None:
+            raw = tuple(x + nearer[:, None, None, None] for x in raw)
         if self.full_size and raw[0].shape[-2:] != images.shape[-2:]:
             finest = F.interpolate(raw[0], size=images.shape[-2:], mode="bilinear", align_corners=False)
             raw = (finest, *raw[1:])
-        return tuple(torch.sigmoid(x) for x in raw), snr
+        return tuple(torch.sigmoid(x) for x in raw), snr, nearer
 
     def _nearness(self, maps: list[Tensor]) -> Tensor:
-        """(N, 1, 1, 1)."""
+        """(N,)."""
         assert self.nearness is not None
         with torch.autocast(maps[0].device.type, enabled=False):
             means = torch.cat([x.to(self.nearness.weight.dtype).mean((2, 3)) for x in maps], 1)
-            number: Tensor = self.nearness(means)[..., None, None]
+            number: Tensor = self.nearness(means)[:, 0]
         return number
