@@ -1,9 +1,9 @@
 """How near everything in an image is, found by trying: one factor on its whole depth map, all else being known.
 
-A gradient sees no farther than neighbouring pixels look alike. Against a wall that is three times nearer than predicted,
-a step of known length moves the image by many pixels more than the warp says, and no gradient leads there. So the
-factor that warps the image best is searched, and the one number per image that tells nearness learns it. Ours;
-plane-sweep stereo (Collins, CVPR 1996) searches likewise, for every pixel.
+A gradient sees no farther than neighbouring pixels look alike. Against a wall three times nearer than predicted, a step
+of known length moves the image by many pixels more than the warp says, and no gradient leads there. So the factor that
+warps the image best is searched, and the one number per image that tells nearness learns it. Ours; plane-sweep stereo
+(Collins, CVPR 1996) searches likewise, for every pixel.
 """
 
 from __future__ import annotations
