@@ -230,11 +230,13 @@ def page(results: list[dict[str, Any]]) -> str:
     rows = [[r["organ"], r["driving"], f"{r['seed']}", f"{r['accepted'][0]}", *(f"{x:.1f}" for x in r["ate_mm"]),
              *(f"{x:.2f}" for x in r["nees"])] for r in results]
     shift, turn = (np.concatenate([r[key] for r in results] or [[]]) for key in ("shift_mm", "turn_deg"))
-    saved = (f"Without loops the graph's error is {np.median(graph):.2f} times that of the motions alone in the "
-             f"median of all {len(graph)}, {graph.max():.2f} times in the worst. With loops the error of the recordings "
-             f"there and back is {np.median(ratio):.2f} times that without in the median, {ratio.max():.2f} times in the worst ({int((ratio > 1).sum())} of {len(ratio)} lose). The "
-             f"accepted loops are {np.median(shift):.1f} mm and {np.median(turn):.1f} degrees off in the median, "
-             f"{shift.max(initial=0):.1f} mm and {turn.max(initial=0):.1f} degrees at most.")
+    lost = int((ratio > 1).sum())
+    saved = (f"Without loops the graph's error is {np.median(graph):.2f} times that of the motions alone in the median "
+             f"of all {len(graph)}, {graph.max():.2f} times in the worst. With loops the error of the recordings there "
+             f"and back is {np.median(ratio):.2f} times that without in the median, {ratio.max():.2f} times in the "
+             f"worst ({lost} of {len(ratio)} lose). The accepted loops are {np.median(shift):.1f} mm and "
+             f"{np.median(turn):.1f} degrees off in the median, {shift.max(initial=0):.1f} mm and "
+             f"{turn.max(initial=0):.1f} degrees at most.")
     header = ["stage", "pairs", "false", "precision", "recall of frames"]
     return TEXT.format(
         revisits=len(revisits), others=len(others), size=SIZE, duration=DURATION_S, stomach=STOMACH_ONE_WAY_S,
