@@ -72,6 +72,11 @@ class CameraBatch:
         return replace(self, intrinsics=self._scaled(width / self.width, height / self.height),
                        width=width, height=height)
 
+    @cached_property
+    def halved(self) -> CameraBatch:
+        """The cameras of the same images at half the size."""
+        return self.resized(self.width // 2, self.height // 2)
+
     def cropped(self, left: Tensor, top: Tensor, width: int, height: int) -> CameraBatch:
         """The cameras of a window of `width` x `height` pixels whose upper left pixel is (left, top), (B,) each."""
         fx, fy, cx, cy = self.intrinsics.unbind(1)

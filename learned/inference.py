@@ -6,6 +6,7 @@ the signals. No truth and no gyro rotation enters.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
@@ -15,7 +16,6 @@ from torch import Tensor
 from learned.camera_rays import CameraBatch
 from learned.lie import halfway, inverse, so3_log
 from learned.losses.photometric import Photometric, compare
-from learned.losses.terms import masked_mean
 from learned.methods import Method
 from learned.warping import WHOLE, DepthKind, project_depth, sample, to_z_depth
 
@@ -24,6 +24,8 @@ SIGNALS = ("photometric", "unwarped", "length", "rotation", "order", "order_rota
 step length over median depth, rotation angle, distance between the two orders' translations over their length, and of
 their rotations, median depth, mean SNR (0 without one)."""
 LEAST = 1e-4
+DARK = 0.01
+"""Grey level of 0..1 up to which a pixel lies in the vignette."""
 
 
 @dataclass(frozen=True)
@@ -37,7 +39,7 @@ class PairEstimate:
     snr: Tensor | None
     """(B,) geometric mean of the SNR over the blocks of both networks; None without vibration."""
     signals: Tensor
-    """(B, 8) the `SIGNALS`."""
+    """(B, S) the signals that were wanted."""
 
 
 @dataclass(frozen=True)
@@ -72,7 +74,7 @@ def distinct(frames: Tensor) -> Shots:
 
 @torch.no_grad()
 def estimate_pairs(method: Method, frames: Tensor, vibration: Tensor | None, cameras: CameraBatch,
-                   depth_kind: DepthKind) -> PairEstimate:
+                   depth_kind: DepthKind, wanted: Sequence[str] = SIGNALS) -> PairEstimate:
     """Measure pairs of frames.
 
     Args:
@@ -81,6 +83,7 @@ def estimate_pairs(method: Method, frames: Tensor, vibration: Tensor | None, cam
         vibration: (B, 6, n) windows centred at the earlier frames; None for a vision-only method.
         cameras: B cameras of images of that size.
         depth_kind: what the depth network's numbers mean.
+        wanted: names of the signals to compute.
     """
     shots = distinct(frames)
     windows = None if vibration is None else vibration[shots.pair][None]
@@ -95,28 +98,37 @@ def estimate_pairs(method: Method, frames: Tensor, vibration: Tensor | None, cam
         every = torch.cat([torch.cat([out.snr_depth[i], out.snr_pose[i, j]], 1) for i, j in ahead]).float()
         snr = every.clamp(min=LEAST).log().mean(1).exp()
     z = to_z_depth(depth, cameras, depth_kind)
-    signals = _signals(frames, depth, T, there, back, snr, cameras, depth_kind)
-    return PairEstimate(T, z, snr, signals)
+    found = _motion_signals(T, there, back, snr)
+    if not {"depth", "length"}.isdisjoint(wanted):
+        found["depth"] = depth.flatten(1).median(1).values
+        found["length"] = T[:, :3, 3].norm(dim=1) / found["depth"]
+    if not {"photometric", "unwarped"}.isdisjoint(wanted):
+        found["photometric"], found["unwarped"] = _photometric_signals(shots, depth, T, cameras, depth_kind)
+    signals = [found[name].clamp(min=LEAST).log() for name in wanted]
+    return PairEstimate(T, z, snr, torch.stack(signals, 1) if signals else T.new_zeros(len(T), 0))
 
 
-def _signals(frames: Tensor, depth: Tensor, T: Tensor, there: Tensor, back: Tensor, snr: Tensor | None,
-             cameras: CameraBatch, depth_kind: DepthKind) -> Tensor:
-    grey = frames.mean(2, keepdim=True)
-    small = [F.avg_pool2d(grey[:, k], 2) for k in (0, 1)]
-    coarse = cameras.resized(cameras.width // 2, cameras.height // 2)
-    where = project_depth(1 / F.avg_pool2d(1 / depth, 2), T, coarse, depth_kind)
-    pixels = torch.where(where.valid, where.pixels, torch.zeros_like(where.pixels))
-    lit = [(image > 0.01).to(image.dtype) for image in small]
-    valid = where.valid & (lit[0] > 0) & (sample(lit[1], pixels) > WHOLE)
-    settings = Photometric()
-    warped, mask = compare(sample(small[1], pixels), small[0], valid, settings)
-    still = compare(small[1], small[0], valid, settings)[0]
-    residual, unwarped = (torch.stack([masked_mean(x[k:k + 1], mask[k:k + 1]) for k in range(len(x))])
-                          for x in (warped, still))
-    length, middle = T[:, :3, 3].norm(dim=1), depth.flatten(1).median(1).values
+def _motion_signals(T: Tensor, there: Tensor, back: Tensor, snr: Tensor | None) -> dict[str, Tensor]:
+    """What the motions tell, (B,) each."""
+    length = T[:, :3, 3].norm(dim=1)
     apart = (there[:, :3, 3] - back[:, :3, 3]).norm(dim=1)
     turn = so3_log(there[:, :3, :3].transpose(1, 2) @ back[:, :3, :3]).norm(dim=1)
-    rotation = so3_log(T[:, :3, :3]).norm(dim=1)
-    rows = [residual, unwarped, length / middle, rotation, apart / (length + 10 * LEAST), turn, middle,
-            torch.ones_like(length) if snr is None else snr]
-    return torch.stack([row.clamp(min=LEAST).log() for row in rows], 1)
+    return {"rotation": so3_log(T[:, :3, :3]).norm(dim=1), "order": apart / (length + 10 * LEAST),
+            "order_rotation": turn, "snr": torch.ones_like(length) if snr is None else snr}
+
+
+def _photometric_signals(shots: Shots, depth: Tensor, T: Tensor, cameras: CameraBatch,
+                         depth_kind: DepthKind) -> tuple[Tensor, Tensor]:
+    """How far the second frames, warped and as they are, are from the first, at half the size, (B,) each."""
+    every = F.avg_pool2d(shots.frames.mean(1, keepdim=True), 2)
+    first, second = every[list(shots.i)], every[list(shots.j)]
+    where = project_depth(1 / F.avg_pool2d(1 / depth, 2), T, cameras.halved, depth_kind)
+    pixels = torch.where(where.valid, where.pixels, torch.zeros_like(where.pixels))
+    seen = sample(torch.cat([second, (second > DARK).to(second.dtype)], 1), pixels)
+    valid = where.valid & (first > DARK) & (seen[:, 1:] > WHOLE)
+    pairs = len(first)
+    different, mask = compare(torch.cat([seen[:, :1], second]), first.repeat(2, 1, 1, 1), valid.repeat(2, 1, 1, 1),
+                              Photometric())
+    weights = mask.to(different.dtype)
+    means = (different * weights).sum((1, 2, 3)) / weights.sum((1, 2, 3)).clamp(min=1)
+    return means[:pairs], means[pairs:]

@@ -12,7 +12,9 @@ import torch
 from learned.camera_rays import CameraBatch, camera_batch
 from learned.depth_uncertainty import DepthUncertainty, depth_uncertainty_from_dict
 from learned.errors import WeightsError
-from learned.inference import SIGNALS, estimate_pairs
+from learned.frozen import frozen
+from learned.inference import estimate_pairs
+from learned.methods import Method
 from learned.pixel_signals import off_axis_angle, pixel_signals
 from learned.predictor import PairPrediction
 from learned.uncertainty import UncertaintyModel, uncertainty_from_dict
@@ -88,15 +90,16 @@ class NetworkPredictor:
         """Motions of B pairs, with covariances, SNR and depth; see `learned.Predictor`."""
         frames = torch.stack([frames_i, frames_j], 1).to(self.device)
         windows = self._windows(imu_windows)
-        estimate = estimate_pairs(self.weights.method, frames, windows, self._cameras(len(frames)),
-                                  self.weights.card["depth_kind"])
-        cov = self.uncertainty.covariance(estimate.signals.cpu().double().numpy(), SIGNALS)
+        wanted = self.uncertainty.signals
+        estimate = estimate_pairs(self.network, frames, windows, self._cameras(len(frames)),
+                                  self.weights.card["depth_kind"], wanted)
+        cov = self.uncertainty.covariance(estimate.signals.cpu().double().numpy(), wanted)
         return PairPrediction(estimate.T_i_j.double(), torch.from_numpy(cov), estimate.snr, estimate.z_depth_i[:, 0])
 
     def depth(self, frames: torch.Tensor, imu_windows: torch.Tensor) -> torch.Tensor:
         """z-depth (B, H, W) of frames (B, 3, H, W) in motion units, without any motion; 0 where nothing is seen."""
         with torch.no_grad():
-            out = self.weights.method(frames[:, None].to(self.device), self._windows(imu_windows), depth_frames=(0,),
+            out = self.network(frames[:, None].to(self.device), self._windows(imu_windows), depth_frames=(0,),
                                       pairs=())
         depth = out.depth[0].depth[0].float()
         return to_z_depth(depth, self._cameras(len(frames)), self.weights.card["depth_kind"])[:, 0]
@@ -120,14 +123,26 @@ class NetworkPredictor:
         return None if model is None else {**model.intervals(), "signals": list(model.signals)}
 
     @cached_property
+    def network(self) -> Method:
+        """What is run: the weights' method, frozen."""
+        return frozen(self.weights.method)
+
+    @cached_property
     def _angle(self) -> torch.Tensor:
         return torch.from_numpy(off_axis_angle(self.camera))
+
+    @cached_property
+    def _camera_batches(self) -> dict[int, CameraBatch]:
+        """By their number: rays of pixels are the same for every batch."""
+        return {}
 
     def _windows(self, imu_windows: torch.Tensor) -> torch.Tensor | None:
         return imu_windows.transpose(1, 2).to(self.device) if self.imu_samples_per_item else None
 
     def _cameras(self, count: int) -> CameraBatch:
-        return camera_batch([self.camera]).to(self.device).repeated(count)
+        if count not in self._camera_batches:
+            self._camera_batches[count] = camera_batch([self.camera]).to(self.device).repeated(count)
+        return self._camera_batches[count]
 
 
 def predictor_for(recording: Recording, weights: Weights, device: str | None = None) -> NetworkPredictor:

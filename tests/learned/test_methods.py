@@ -18,6 +18,7 @@ from learned.methods import (
     method_config,
     snr_summary,
 )
+from learned.methods.parametrisation import typical_depth
 from learned.vibration_fusion import STRATEGIES, FusionConfig
 from vio.errors import ConfigError, VioError
 
@@ -96,7 +97,8 @@ def test_motions_are_poses_of_camera_j_in_camera_i(name, pair):
     raw = torch.tensor(published(name, poses[first], poses[second]))[None]
     if pose.in_depths:
         raw[:, 3:] /= 2.5
-    T = pose.motion(raw, *pair, torch.tensor([1.25, 5.0], dtype=raw.dtype).view(1, 1, 1, 2))[0].numpy()
+    typical = typical_depth(torch.tensor([1.25, 5.0], dtype=raw.dtype).view(1, 1, 1, 2))
+    T = pose.motions(raw[:, None], [pair], {pair[0]: typical})[0, 0].numpy()
     np.testing.assert_allclose(T, np.linalg.inv(poses[pair[0]]) @ poses[pair[1]], atol=1e-9)
 
 
