@@ -15,7 +15,7 @@ from torch import Tensor
 
 from learned.camera_rays import CameraBatch
 from learned.lie import halfway, inverse, so3_log
-from learned.losses.photometric import Photometric, compare
+from learned.losses.photometric import Photometric, countable, match_brightness, photometric_map
 from learned.methods import Method
 from learned.warping import WHOLE, DepthKind, project_depth, sample, to_z_depth
 
@@ -126,9 +126,9 @@ def _photometric_signals(shots: Shots, depth: Tensor, T: Tensor, cameras: Camera
     pixels = torch.where(where.valid, where.pixels, torch.zeros_like(where.pixels))
     seen = sample(torch.cat([second, (second > DARK).to(second.dtype)], 1), pixels)
     valid = where.valid & (first > DARK) & (seen[:, 1:] > WHOLE)
-    pairs = len(first)
-    different, mask = compare(torch.cat([seen[:, :1], second]), first.repeat(2, 1, 1, 1), valid.repeat(2, 1, 1, 1),
-                              Photometric())
-    weights = mask.to(different.dtype)
-    means = (different * weights).sum((1, 2, 3)) / weights.sum((1, 2, 3)).clamp(min=1)
-    return means[:pairs], means[pairs:]
+    settings, target = Photometric(), first.repeat(2, 1, 1, 1)
+    shown = match_brightness(torch.cat([seen[:, :1], second]), target, valid.repeat(2, 1, 1, 1), settings)
+    different = photometric_map(shown, target, settings).unflatten(0, (2, len(first)))
+    weights = countable(valid, settings).to(different.dtype)
+    warped, still = (different * weights).sum((2, 3, 4)) / weights.sum((1, 2, 3)).clamp(min=1)
+    return warped, still

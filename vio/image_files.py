@@ -50,6 +50,13 @@ def decode_image(path: Path, what: str, depth: bool = False) -> NDArray[Any]:
     return np.asarray(image)
 
 
+def rgb(image: NDArray[Any]) -> NDArray[Any]:
+    """Grey (H, W) as it is, B, G, R (H, W, 3) as R, G, B."""
+    import cv2
+
+    return np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2RGB)) if image.ndim == 3 else image
+
+
 @contextmanager
 def quiet_decoder() -> Iterator[None]:
     """Keep OpenCV from writing to stderr what is raised as an error here."""

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from vio.calibration import Calibration
 from vio.depth import DepthEncoding, LinearDepth, RelativeInverseDepth
 from vio.errors import RecordingError
-from vio.image_files import decode_image
+from vio.image_files import decode_image, rgb
 from vio.imu import ImuSamples, check_coverage
 from vio.trajectory import Trajectory
 from vio.video_frames import VideoFrames
@@ -153,8 +153,7 @@ class Recording:
         elif path is None:
             raise RecordingError(f"frame {k}: this recording lists frame times but no images")
         else:
-            image = decode_image(path, f"frame {k}")
-            image = image[..., ::-1].copy() if image.ndim == 3 else image
+            image = rgb(decode_image(path, f"frame {k}"))
         camera = self.calibration.camera
         height, width = image.shape[:2]
         if camera is not None and (width, height) != (camera.width, camera.height):
