@@ -128,7 +128,7 @@ def _photometric_signals(shots: Shots, depth: Tensor, T: Tensor, cameras: Camera
     valid = where.valid & (first > DARK) & (seen[:, 1:] > WHOLE)
     settings, target = Photometric(), first.repeat(2, 1, 1, 1)
     shown = match_brightness(torch.cat([seen[:, :1], second]), target, valid.repeat(2, 1, 1, 1), settings)
-    different = photometric_map(shown, target, settings).unflatten(0, (2, len(first)))
+    different = torch.unflatten(photometric_map(shown, target, settings), 0, (2, len(first)))
     weights = countable(valid, settings).to(different.dtype)
     warped, still = (different * weights).sum((2, 3, 4)) / weights.sum((1, 2, 3)).clamp(min=1)
     return warped, still
