@@ -22,7 +22,7 @@ from fusion.graph import read_log_scales, read_states
 from fusion.initialization import search_log_scale
 from fusion.joint import SEED, with_assumed_scale
 from fusion.loops import GraphLoops, close_loops, none_held
-from fusion.motion_noise import is_right, translation_noise, with_noise
+from fusion.motion_noise import bounded, is_right, translation_noise, with_noise
 from fusion.native_engine import NativeEngine
 from fusion.problem import Problem
 from fusion.result import BiasStep, LoopConclusion, ScaleConclusion, ScalePolicy
@@ -98,9 +98,10 @@ class GraphEstimator:
             with self.stages("motion_noise"):
                 factor = translation_noise(self.engine, Begin(final.model, final.solution.values), final.term,
                                            np.random.default_rng(SEED), lasting(self.problem))
-            if is_right(factor) if noise == 1.0 else abs(factor - 1) < SETTLED:
+            corrected = bounded(noise * factor)
+            if (is_right(factor) if noise == 1.0 else abs(factor - 1) < SETTLED) or corrected == noise:
                 break
-            noise *= factor
+            noise = corrected
             self.problem = replace(given, motions=with_noise(given.motions, 1.0, noise))
         else:
             final, conclusion, fixed_chi2, inflation = self._solve()
@@ -264,7 +265,8 @@ class GraphEstimator:
         log_scale = read_log_scales(final.solution.values, count)
         share = len(final.rejected) / len(self.problem.motions)
         signal = final.term.signal(final.solution.values)
-        return final, FreePass(final.imu_chi2, log_scale, np.sqrt(final.uncertainty.log_scale_variance), share, signal)
+        return final, FreePass(final.imu_chi2, log_scale, np.sqrt(final.uncertainty.log_scale_variance),
+                               self.segments.t_s - self.problem.t_s[0], share, signal)
 
     def _uncertainty(self, final: _Pass) -> Uncertainty:
         estimated = final.term.segment is not None
