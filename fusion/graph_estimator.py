@@ -9,8 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusion import scale as scale_policy
+from fusion.bias_steps import find_bias_steps, suspect_stretches, with_released
 from fusion.body_motion import BodyMotion, without_body_motion
 from fusion.chain_engine import ChainEngine
+from fusion.chain_state import ChainState
 from fusion.checkpoint import Checkpoint, ResumableEngine
 from fusion.config import RefineConfig
 from fusion.correlated_noise import lasting, with_lasting_errors
@@ -20,10 +22,10 @@ from fusion.graph import read_log_scales, read_states
 from fusion.initialization import search_log_scale
 from fusion.joint import SEED, with_assumed_scale
 from fusion.loops import GraphLoops, close_loops, none_held
-from fusion.motion_noise import is_right, translation_noise, with_noise
+from fusion.motion_noise import bounded, is_right, translation_noise, with_noise
 from fusion.native_engine import NativeEngine
 from fusion.problem import Problem
-from fusion.result import LoopConclusion, ScaleConclusion, ScalePolicy
+from fusion.result import BiasStep, LoopConclusion, ScaleConclusion, ScalePolicy
 from fusion.scale import FreePass, Segments
 from fusion.solve import MotionTerm, Solution
 from fusion.stages import Stages
@@ -70,6 +72,7 @@ class GraphEstimator:
         if ChainEngine.suits(problem):
             self.engine = ChainEngine() if checkpoint is None else ResumableEngine(ChainEngine(), checkpoint)
         self.notes: list[str] = []
+        self.bias_steps: tuple[BiasStep, ...] = ()
         self.segments: Segments = scale_policy.make_segments(problem.t_s, config.scale.segment_s)
 
     def estimate(self) -> Estimate:
@@ -95,9 +98,10 @@ class GraphEstimator:
             with self.stages("motion_noise"):
                 factor = translation_noise(self.engine, Begin(final.model, final.solution.values), final.term,
                                            np.random.default_rng(SEED), lasting(self.problem))
-            if is_right(factor) if noise == 1.0 else abs(factor - 1) < SETTLED:
+            corrected = bounded(noise * factor)
+            if (is_right(factor) if noise == 1.0 else abs(factor - 1) < SETTLED) or corrected == noise:
                 break
-            noise *= factor
+            noise = corrected
             self.problem = replace(given, motions=with_noise(given.motions, 1.0, noise))
         else:
             final, conclusion, fixed_chi2, inflation = self._solve()
@@ -157,7 +161,15 @@ class GraphEstimator:
 
     def _trusted_start(self, log_scale: float) -> Begin:
         """A start in whose stretches the IMU agrees with the rest, or is trusted less."""
+        self.problem = with_released(self.problem, self.bias_steps)
         start = self._start(log_scale, 1.0)
+        suspects = suspect_stretches(start) if isinstance(start.values, ChainState) and not self.bias_steps else []
+        if suspects:
+            with self.stages("bias_steps"):
+                self.bias_steps = find_bias_steps(self.problem, self.config, self.segments, start, suspects)
+        if suspects and self.bias_steps:
+            self.problem = with_released(self.problem, self.bias_steps)
+            start = self._start(log_scale, 1.0)
         for without_imu in (False, True):
             bad = contradicted(start.stretches)
             if not bad:
@@ -253,7 +265,8 @@ class GraphEstimator:
         log_scale = read_log_scales(final.solution.values, count)
         share = len(final.rejected) / len(self.problem.motions)
         signal = final.term.signal(final.solution.values)
-        return final, FreePass(final.imu_chi2, log_scale, np.sqrt(final.uncertainty.log_scale_variance), share, signal)
+        return final, FreePass(final.imu_chi2, log_scale, np.sqrt(final.uncertainty.log_scale_variance),
+                               self.segments.t_s - self.problem.t_s[0], share, signal)
 
     def _uncertainty(self, final: _Pass) -> Uncertainty:
         estimated = final.term.segment is not None
@@ -300,4 +313,4 @@ class GraphEstimator:
             joint = None if joint is None else with_assumed_scale(
                 joint, T, assumed, T_body_camera, np.random.default_rng(SEED + 1))
         return Estimate(T, cov, states.v, states.gyro_bias, states.accel_bias, log_scale, log_scale_sd, conclusion,
-                        final.rejected, fixed_chi2, inflation, joint, tuple(self.notes))
+                        final.rejected, fixed_chi2, inflation, joint, tuple(self.notes), bias_steps=self.bias_steps)

@@ -13,12 +13,12 @@ the covariance is a sum over pieces, without propagation. Same model as Forster,
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from fusion.preintegration import INTEGRATION_DENSITY
+from fusion.preintegration import INTEGRATION_DENSITY, JUMP_SD
 from vio import se3
 from vio.imu import ImuNoise, ImuPieces
 
@@ -67,6 +67,10 @@ class InertialSteps:
         return InertialSteps(self.dt_s[cut], self.R[cut], self.v[cut], self.p[cut], self.R_bg[cut], self.v_bg[cut],
                              self.v_ba[cut], self.p_bg[cut], self.p_ba[cut], self.whiten[cut], self.free_fall[cut],
                              self.bias_walk_sd[cut], self.accel_bias, self.gyro_bias)
+
+    def released(self, where: NDArray[np.bool_]) -> InertialSteps:
+        """The same with biases that may jump over some intervals (N,)."""
+        return replace(self, bias_walk_sd=np.hypot(self.bias_walk_sd, where[:, None] * JUMP_SD))
 
     def rotations(self, gyro_bias_rad_s: Array) -> Array:
         """(N, 3, 3) rotations corrected to another gyro bias (3,)."""

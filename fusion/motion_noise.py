@@ -27,8 +27,9 @@ Lasting = Callable[[Array], Array]
 
 PROBED_MOTIONS = 4000
 """Motions times probes: the factor is then known to a few percent."""
-LEAST_REDUNDANCY = 30.0
-"""Below, the data do not tell the motions' noise from the capsule's motion."""
+LEAST_REDUNDANCY, LEAST_SHARE = 30.0, 0.03
+"""Below, in all or per translation, the data do not tell the motions' noise from the capsule's motion: where the
+estimate follows the motions alone, probes of 1000 of them scatter by 25 about none."""
 LEAST_MOTIONS = 50
 LARGEST = 10.0
 """Factor, up or down, beyond which it is no longer a noise card that is wrong."""
@@ -91,7 +92,8 @@ def translation_noise(engine: Engine, begin: Begin, term: MotionTerm, rng: np.ra
             longer = lasting(white)[0]
             left = longer - _followed(engine, begin, term, blocks, longer * accepted[:, None])
             redundancy += float((left**2 - (z - followed) ** 2)[accepted].sum()) / probes
-    return bounded(np.sqrt(residual2 / redundancy)) if redundancy > LEAST_REDUNDANCY else 1.0
+    least = max(LEAST_REDUNDANCY, LEAST_SHARE * 3 * int(accepted.sum()))
+    return bounded(np.sqrt(residual2 / redundancy)) if redundancy > least else 1.0
 
 
 def _followed(engine: Engine, begin: Begin, term: MotionTerm, blocks: Linearized, error: Array) -> Array:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import lru_cache
 
 import gtsam
@@ -15,6 +16,8 @@ Array = NDArray[np.float64]
 INTEGRATION_DENSITY = 1e-5
 """Position noise of the integration scheme itself [m/sqrt(s)]; far below every sensor's."""
 INFLATION_STEPS_PER_OCTAVE = 4
+JUMP_SD = np.repeat([0.5, 0.05], 3)
+"""Change of accelerometer [m/s²] and gyro bias [rad/s] per interval where they are let go: any that occurs."""
 
 
 def make_bias(accel_m_s2: Array, gyro_rad_s: Array) -> gtsam.imuBias.ConstantBias:
@@ -35,6 +38,13 @@ def _params(noise: ImuNoise, accel_inflation: float, gyro_inflation: float) -> g
     return params
 
 
+def _jumping(noise: ImuNoise, pieces: ImuPieces, k: int) -> ImuNoise:
+    """Noise whose biases jump over interval k."""
+    per_root_s = JUMP_SD / np.sqrt(pieces.dt_s[pieces.first[k]:pieces.first[k + 1]].sum())
+    return replace(noise, accel_walk_m_s3_rthz=float(np.hypot(noise.accel_walk_m_s3_rthz, per_root_s[0])),
+                   gyro_walk_rad_s2_rthz=float(np.hypot(noise.gyro_walk_rad_s2_rthz, per_root_s[3])))
+
+
 def _rounded(inflation: Array) -> Array:
     """Inflations on a logarithmic grid, so that few parameter sets serve all intervals."""
     steps: Array = np.round(np.log2(np.maximum(inflation, 1.0)) * INFLATION_STEPS_PER_OCTAVE)
@@ -44,7 +54,8 @@ def _rounded(inflation: Array) -> Array:
 
 def preintegrate(pieces: ImuPieces, noise: ImuNoise, accel_bias_m_s2: Array, gyro_bias_rad_s: Array,
                  accel_inflation: Array, gyro_inflation: Array,
-                 span: tuple[int, int]) -> list[gtsam.PreintegratedCombinedMeasurements]:
+                 span: tuple[int, int],
+                 released: NDArray[np.bool_] | None = None) -> list[gtsam.PreintegratedCombinedMeasurements]:
     """Preintegrate the intervals `span[0]` to `span[1]` (exclusive), linearised at one bias.
 
     Args:
@@ -55,12 +66,14 @@ def preintegrate(pieces: ImuPieces, noise: ImuNoise, accel_bias_m_s2: Array, gyr
         accel_inflation: (M,) factor on the accelerometer density in every interval, at least 1.
         gyro_inflation: (M,) factor on the gyro density in every interval, at least 1.
         span: first interval and one past the last.
+        released: (M,) intervals over which the biases may jump; None = nowhere.
     """
     bias = make_bias(accel_bias_m_s2, gyro_bias_rad_s)
     accel_factor, gyro_factor = _rounded(accel_inflation), _rounded(gyro_inflation)
     out = []
     for k in range(*span):
-        params = _params(noise, float(accel_factor[k]), float(gyro_factor[k]))
+        walks = noise if released is None or not released[k] else _jumping(noise, pieces, k)
+        params = _params(walks, float(accel_factor[k]), float(gyro_factor[k]))
         measurement = gtsam.PreintegratedCombinedMeasurements(params, bias)
         for n in range(pieces.first[k], pieces.first[k + 1]):
             measurement.integrateMeasurement(pieces.accel_m_s2[n], pieces.gyro_rad_s[n], pieces.dt_s[n])

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
-from typing import Literal
+from dataclasses import asdict, dataclass, field
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,6 +23,8 @@ Estimator = Literal["graph", "ekf", "motions"]
 ScalePolicy = Literal["free", "prior", "fixed"]
 
 SAME_FRAME_S = 1e-3
+PLAIN = 5.0
+"""Size over sd of a bias's step along one axis at which its sensor is named."""
 
 
 @dataclass(frozen=True)
@@ -40,6 +42,54 @@ class ScaleConclusion:
 
 
 @dataclass(frozen=True)
+class BiasStep:
+    """A step of the IMU's biases, and that they were let go there."""
+
+    first_frame: int
+    """Node of the trajectory before it …"""
+    last_frame: int
+    """… and after it: in between, the biases are free."""
+    start_s: float
+    """Of the time in which it lies …"""
+    end_s: float
+    """… and the end of it."""
+    gyro_rad_s: tuple[float, ...]
+    """(3,) body axes."""
+    gyro_sd_rad_s: tuple[float, ...]
+    accel_m_s2: tuple[float, ...]
+    """(3,)"""
+    accel_sd_m_s2: tuple[float, ...]
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain values for `summary.json`, and in words."""
+        return asdict(self) | {"words": self.in_words()}
+
+    @staticmethod
+    def from_dict(values: Mapping[str, Any]) -> BiasStep:
+        """What `to_dict` wrote."""
+        sizes = [tuple(map(float, values[key])) for key in ("gyro_rad_s", "gyro_sd_rad_s", "accel_m_s2",
+                                                            "accel_sd_m_s2")]
+        return BiasStep(int(values["first_frame"]), int(values["last_frame"]), float(values["start_s"]),
+                        float(values["end_s"]), *sizes)
+
+    def in_words(self) -> str:
+        """Which sensors plainly stepped, how far and when."""
+        sizes = (("gyro", np.rad2deg(self.gyro_rad_s), np.rad2deg(self.gyro_sd_rad_s), "deg/s"),
+                 ("accelerometer", np.array(self.accel_m_s2), np.array(self.accel_sd_m_s2), "m/s²"))
+        parts = [f"the {sensor}'s bias steps by {_length(size, sd)} {unit}" for sensor, size, sd, unit in sizes
+                 if (np.abs(size) > PLAIN * sd).any()]
+        return f"{' and '.join(parts) or 'the biases step'} between {self.start_s:.1f} and {self.end_s:.1f} s"
+
+
+def _length(size: Array, sd: Array) -> str:
+    """Length of a vector with its sd, to the sd's second digit."""
+    length = float(np.linalg.norm(size))
+    along = float(np.linalg.norm(size / length * sd))
+    digits = max(0, 1 - int(np.floor(np.log10(along))))
+    return f"{length:.{digits}f} ± {along:.{digits}f}"
+
+
+@dataclass(frozen=True)
 class ImuConclusion:
     """How well the inertial data agree with the rest."""
 
@@ -49,6 +99,8 @@ class ImuConclusion:
     """Factor on the accelerometer density that the scale policy asked for; 1 = as calibrated."""
     gaps: tuple[Gap, ...]
     """Holes over 0.5 s; their frame intervals carry no inertial factor."""
+    bias_steps: tuple[BiasStep, ...] = ()
+    """Where the biases stepped, and were let go."""
 
 
 @dataclass(frozen=True)

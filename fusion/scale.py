@@ -60,6 +60,8 @@ class FreePass:
     imu_chi2: float
     log_scale: Array
     log_scale_sd: Array
+    segment_s: Array
+    """Centres of the segments, from the first frame."""
     rejected_share: float
     signal: float
     """Root mean square of the steps over their noise."""
@@ -90,11 +92,14 @@ def reasons_against(free: FreePass, problem: Problem, config: ScaleConfig) -> st
         return (f"the IMU disagrees with the motions even with free scale (chi² {free.imu_chi2:.2f} per dof, "
                 f"limit {config.imu_chi2_limit:g}): the body moves in ways the camera does not see, or the IMU is not "
                 "what its calibration says")
-    moved = abs(float(free.log_scale.mean()) - problem.scale_log_mean)
-    allowed = PLAUSIBLE_SDS * problem.scale_log_sd + 3 * float(free.log_scale_sd.mean())
-    if moved > allowed:
-        return (f"freed scale moved {moved:.2f} in log from the prior, more than {PLAUSIBLE_SDS:g} prior sds "
-                f"({allowed:.2f})")
+    for end_s in (min(prior_lasts_s(problem, config), free.segment_s[-1]), free.segment_s[-1]):
+        part = free.segment_s <= max(end_s, free.segment_s[0])
+        moved = abs(float(free.log_scale[part].mean()) - problem.scale_log_mean)
+        prior_sd = float(np.hypot(problem.scale_log_sd, walked_sd(end_s, config)))
+        allowed = PLAUSIBLE_SDS * prior_sd + 3 * float(free.log_scale_sd[part].mean())
+        if moved > allowed:
+            return (f"freed scale moved {moved:.2f} in log from the prior in the mean of the first {end_s:.0f} s, more "
+                    f"than {PLAUSIBLE_SDS:g} sds of the prior and the walk away from it ({allowed:.2f})")
     if free.rejected_share > PLAUSIBLE_REJECTED:
         return (f"freeing the scale rejected {100 * free.rejected_share:.0f} % of the motions "
                 f"(limit {100 * PLAUSIBLE_REJECTED:.0f} %)")
@@ -148,14 +153,20 @@ def with_gain(conclusion: ScaleConclusion, gain_sd: float) -> ScaleConclusion:
 
 
 def assumed_sd(problem: Problem, config: ScaleConfig) -> float:
-    """Sd of the recording's mean log scale where it is not measured: the prior's, and the walk away from it.
-
-    A random walk from 0 has mean square walk² T / 3 in its average over T.
-    """
+    """Sd of the recording's mean log scale where it is not measured: the prior's, and the walk away from it."""
     if problem.scale_log_sd == 0:
         return 0.0
-    walked = config.walk_per_sqrt_s**2 * float(problem.t_s[-1] - problem.t_s[0]) / 3
-    return float(np.sqrt(problem.scale_log_sd**2 + walked))
+    return float(np.hypot(problem.scale_log_sd, walked_sd(float(problem.t_s[-1] - problem.t_s[0]), config)))
+
+
+def walked_sd(span_s: float, config: ScaleConfig) -> float:
+    """How far the mean log scale over a time walks from where it began: walk² T / 3 is its mean square."""
+    return float(config.walk_per_sqrt_s * np.sqrt(span_s / 3))
+
+
+def prior_lasts_s(problem: Problem, config: ScaleConfig) -> float:
+    """Time until the log scale has walked as far as its prior is wide."""
+    return (problem.scale_log_sd / config.walk_per_sqrt_s) ** 2
 
 
 def hardly_moved(free: FreePass) -> str:

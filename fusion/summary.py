@@ -30,7 +30,8 @@ def summarize(refinement: Refinement) -> dict[str, Any]:
         "imu": {"chi2_per_dof": r.imu.chi2_per_dof, "inflation": r.imu.inflation,
                 "gyro_bias_rad_s": r.gyro_bias_rad_s.mean(axis=0).tolist(),
                 "accel_bias_m_s2": r.accel_bias_m_s2.mean(axis=0).tolist(),
-                "gaps": [{"start_s": g.start_s, "end_s": g.end_s} for g in r.imu.gaps]},
+                "gaps": [{"start_s": g.start_s, "end_s": g.end_s} for g in r.imu.gaps],
+                "bias_steps": [step.to_dict() for step in r.imu.bias_steps]},
         "camera_imu": r.camera_imu.to_dict(),
         "motions": {"used": r.motions_used, "rejected": len(r.rejected), "bridged": r.bridged,
                     "rotation_noise": r.motion_noise[0], "translation_noise": r.motion_noise[1]},
@@ -74,6 +75,7 @@ def sentences(summary: dict[str, Any]) -> str:
         f"scale: {scale['policy']} – {scale['reason']}",
         f"motions: {summary['motions']['used']} used, {summary['motions']['rejected']} rejected",
     ]
+    lines += [f"imu: {step['words']}; it was let go there" for step in summary["imu"]["bias_steps"]]
     if summary["loops"]["proposed"]:
         lines.append(f"loops: {loops_in_words(summary['loops'])}")
     if "online" in summary:

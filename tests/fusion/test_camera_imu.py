@@ -101,6 +101,7 @@ def test_the_redundancy_is_that_of_the_dense_hat_matrix(short, monkeypatch):
     expected = np.sqrt((b[rows] ** 2).sum() / (len(rows) - np.trace(hat[np.ix_(rows, rows)])))
     module = importlib.import_module("fusion.motion_noise")
     monkeypatch.setattr(module, "LEAST_REDUNDANCY", 0.0)
+    monkeypatch.setattr(module, "LEAST_SHARE", 0.0)
     monkeypatch.setattr(module, "LEAST_MOTIONS", 0)
     begin = Begin(fixed.model, values)
     factor = translation_noise(estimator.engine, begin, term, np.random.default_rng(0))
