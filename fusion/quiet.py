@@ -77,7 +77,7 @@ def _drifting(turning: Array, force: Array, n: Array) -> Test:
     def test(first: Indices, last: Indices) -> tuple[Array, Array]:
         mean = pushed[last] - pushed[first]
         about = pushed2[last] - pushed2[first] - np.einsum("nk,nk->n", mean, mean) / (weight[last] - weight[first])
-        return turned[last] - turned[first] + about, 3.0 * (2 * (last - first) - 1)
+        return turned[last] - turned[first] + about, np.asarray(3.0 * (2 * (last - first) - 1), float)
 
     return test
 

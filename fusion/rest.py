@@ -20,6 +20,7 @@ within k σ(τ), over k² σ² / (v T) at most: what rest accumulates is then bo
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -119,7 +120,7 @@ def find_rests(problem: Problem, felt: ImuSamples, states: States, accepted: Boo
     spread = _lasting_factor(problem)
     for chain in chains:
         level = FALSE_ALARM / len(chains) / windows(count, SHORTEST_CHAIN, count)
-        still = passing(still, SHORTEST_CHAIN, count, lambda a, b, chain=chain: _chained(chain, spread, a, b), level)
+        still = passing(still, SHORTEST_CHAIN, count, partial(_chained, chain, spread), level)
     found = []
     for first, last in _runs(still):
         judged = _judge(problem, chains, spread, first, last, log_scale, config)
@@ -220,7 +221,7 @@ def _far_from_zero(motions: ScaledMotions) -> Bools:
 def _lone(moving: Bools) -> Bools:
     """(C,) intervals without one that moves on either side: a capsule does not jump there and lie still again."""
     beside = np.concatenate([[False], moving, [False]])
-    return ~(beside[:-2] | beside[2:])
+    return np.asarray(~(beside[:-2] | beside[2:]))
 
 
 def _lasting_factor(problem: Problem) -> float:

@@ -64,7 +64,7 @@ class Clock:
             middle = 0.5 * (low + high)
             early = self(middle)[0] < own_s
             low, high = np.where(early, middle, low), np.where(early, high, middle)
-        return high
+        return np.asarray(high)
 
 
 class HaltingPath(NominalPath):
