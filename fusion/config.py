@@ -37,6 +37,19 @@ class ScaleConfig:
 
 
 @dataclass(frozen=True)
+class RestConfig:
+    """Where the capsule lies still."""
+
+    policy: Literal["auto", "off"] = "auto"
+    """"auto" looks for it."""
+    found_m_s: float = 1e-4
+    """Creep that must be found [m/s]: no stretch is called rest that is too short for it. Slowest in transit."""
+    slowest_m_s: float = 1e-6
+    """What does not rest goes at least this fast [m/s]: the default assumes nothing, for noise hides slower creep for
+    hours. Larger only where that is known, as of a phantom's drive."""
+
+
+@dataclass(frozen=True)
 class SolverConfig:
     """Gauss-Newton and the chunked start."""
 
@@ -63,6 +76,7 @@ class RefineConfig:
     estimator: Literal["auto", "graph", "ekf"] = "auto"
     robust: RobustConfig = field(default_factory=RobustConfig)
     scale: ScaleConfig = field(default_factory=ScaleConfig)
+    rest: RestConfig = field(default_factory=RestConfig)
     solver: SolverConfig = field(default_factory=SolverConfig)
     initial: InitialConfig = field(default_factory=InitialConfig)
 
@@ -107,6 +121,7 @@ def load_config(path: str | Path) -> RefineConfig:
 CHOICES = {
     "estimator": ("auto", "graph", "ekf"),
     "scale.policy": ("auto", "free", "prior", "fixed"),
+    "rest.policy": ("auto", "off"),
 }
 
 

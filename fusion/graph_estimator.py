@@ -1,4 +1,4 @@
-"""The factor-graph recipe: chunks → fixed scale → scale policy → Huber → gate → Gaussian → loops → covariances."""
+"""The factor-graph recipe: chunks, fixed scale, scale policy, Huber, gate, Gaussian, rest, loops, covariances."""
 
 from __future__ import annotations
 
@@ -25,7 +25,15 @@ from fusion.loops import GraphLoops, close_loops, none_held
 from fusion.motion_noise import bounded, is_right, translation_noise, with_noise
 from fusion.native_engine import NativeEngine
 from fusion.problem import Problem
-from fusion.result import BiasStep, LoopConclusion, ScaleConclusion, ScalePolicy
+from fusion.rest import find_rests, with_rests
+from fusion.result import (
+    NO_REST,
+    BiasStep,
+    LoopConclusion,
+    RestConclusion,
+    ScaleConclusion,
+    ScalePolicy,
+)
 from fusion.scale import FreePass, Segments
 from fusion.solve import MotionTerm, Solution
 from fusion.stages import Stages
@@ -68,6 +76,7 @@ class GraphEstimator:
     def __init__(self, problem: Problem, config: RefineConfig, stages: Stages,
                  checkpoint: Checkpoint | None = None, loops: GraphLoops | None = None) -> None:
         self.problem, self.config, self.stages, self.loops = problem, config, stages, loops
+        self._felt = problem.samples
         self.engine: Engine = NativeEngine()
         if ChainEngine.suits(problem):
             self.engine = ChainEngine() if checkpoint is None else ResumableEngine(ChainEngine(), checkpoint)
@@ -105,9 +114,32 @@ class GraphEstimator:
             self.problem = replace(given, motions=with_noise(given.motions, 1.0, noise))
         else:
             final, conclusion, fixed_chi2, inflation = self._solve()
+        final, rest = self._rested(final, conclusion)
         final, closed = self._closed(final, conclusion)
         with self.stages("covariances"):
-            return replace(self._read(final, conclusion, fixed_chi2, inflation), translation_noise=noise, loops=closed)
+            return replace(self._read(final, conclusion, fixed_chi2, inflation), translation_noise=noise, loops=closed,
+                           rest=rest)
+
+    def _rested(self, final: _Pass, conclusion: ScaleConclusion) -> tuple[_Pass, RestConclusion]:
+        """The solution that knows where the capsule lay still, the same where it never did."""
+        if self.config.rest.policy == "off":
+            return final, NO_REST
+        values, m = final.solution.values, len(self.problem)
+        log_scale = np.full(m, conclusion.log_mean)
+        if final.term.segment is not None:
+            log_scale = read_log_scales(values, len(self.segments.t_s))[self.segments.of_node]
+        with self.stages("rest"):
+            rests = find_rests(self.problem, self._felt, read_states(values, 0, m), final.term.weight == 1.0, log_scale,
+                               self.config.rest)
+            try:
+                found = with_rests(self.engine, Begin(final.model, values), final.term, rests, self.config)
+            except EstimationError as error:
+                self.notes.append(f"{error}; refined without knowledge of rest")
+                return final, NO_REST
+        if found is None:
+            return final, NO_REST
+        term, solution, rests = found
+        return self._finished(final.model, term, solution), rests.conclusion()
 
     def _closed(self, final: _Pass, conclusion: ScaleConclusion) -> tuple[_Pass, LoopConclusion | None]:
         """The solution with the loops that hold, the same where none does, and what became of all."""

@@ -169,7 +169,8 @@ def with_loops(term: MotionTerm, loops: MotionTerm, chosen: Bools, huber: Array 
     m, extra = term.motions, loops.motions.select(chosen)
     i, j, R, t, whiten = (np.concatenate([getattr(m, name), getattr(extra, name)])
                           for name in ("i", "j", "R", "t", "whiten"))
-    motions = ScaledMotions(i, j, R, t, whiten, m.T_body_camera)
+    held = None if m.held_log_scale is None else np.concatenate([m.held_log_scale, np.full(len(extra), np.nan)])
+    motions = ScaledMotions(i, j, R, t, whiten, m.T_body_camera, held)
     segment = None if term.segment is None or loops.segment is None else \
         np.concatenate([term.segment, loops.segment[chosen]])
     return replace(term, motions=motions, segment=segment, huber=huber,

@@ -141,7 +141,7 @@ def conclude(recording: Recording, motions: RelativeMotions, problem: Problem, e
         timing_s=dict(stages.seconds), peak_rss_bytes=_peak_rss_bytes(), joint=estimate.joint,
         view=View(problem.first_frame, problem.motions.T_body_camera, recording.calibration.camera,
                   motions.scale_log_mean),
-        inertial=inertial_levels(recording.imu, recording.imu_t_s),
+        inertial=inertial_levels(recording.imu, recording.imu_t_s), rest=estimate.rest,
     )
 
 

@@ -123,6 +123,19 @@ NO_LOOPS = LoopConclusion()
 
 
 @dataclass(frozen=True)
+class RestConclusion:
+    """Where the capsule lay still."""
+
+    span: NDArray[np.int64] = field(default_factory=lambda: np.zeros((0, 2), np.int64))
+    """(R, 2) first and last node of every stretch, in order."""
+    displacement_sd_m: Array = field(default_factory=lambda: np.zeros(0))
+    """(R,) how surely the displacement over it was taken to be zero, beside what the motions say."""
+
+
+NO_REST = RestConclusion()
+
+
+@dataclass(frozen=True)
 class View:
     """What it takes to lay a pixel of a frame into the world."""
 
@@ -198,6 +211,8 @@ class Refinement:
     """What the IMU felt along time; None when unknown."""
     loops: LoopConclusion = NO_LOOPS
     """What became of the loops that were proposed; nothing where none was looked for."""
+    rest: RestConclusion = NO_REST
+    """Where the capsule lay still; nothing where that was not looked for."""
     online: OnlineConclusion | None = None
     """Where the recording was estimated frame by frame; the trajectory then holds poses as they left the lag."""
 

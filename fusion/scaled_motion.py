@@ -42,14 +42,17 @@ class ScaledMotions:
     """(N, 6, 6) inverse Cholesky factor of the covariance of [e_R, e_t]."""
     T_body_camera: Array
     """(4, 4)"""
+    held_log_scale: Array | None = None
+    """(N,) log scale of motions that say nothing of it; NaN where it is estimated. None = of all."""
 
     def __len__(self) -> int:
         return len(self.i)
 
     def select(self, index: NDArray[np.int64] | NDArray[np.bool_] | slice, first_node: int = 0) -> ScaledMotions:
         """The motions at `index`, with nodes renumbered from `first_node`."""
+        held = None if self.held_log_scale is None else self.held_log_scale[index]
         return ScaledMotions(self.i[index] - first_node, self.j[index] - first_node, self.R[index], self.t[index],
-                             self.whiten[index], self.T_body_camera)
+                             self.whiten[index], self.T_body_camera, held)
 
     def surest_neighbours(self, nodes: int) -> NDArray[np.int64]:
         """(nodes-1,) the surest motion from every node to the next, -1 where none is: the choice of `chain_motions`."""
@@ -115,14 +118,14 @@ def make_motions(i: NDArray[np.int64], j: NDArray[np.int64], T_i_j: Array, cov: 
 def residuals(motions: ScaledMotions, R: Array, p: Array, log_scale: Array) -> Array:
     """Whitened residuals (N, 6) at body poses R (M, 3, 3), p (M, 3) and per-motion log scales (N,)."""
     R_pred, t_pred, _ = _predict(motions, R, p)
-    e = _errors(np.swapaxes(motions.R, 1, 2), motions.t, R_pred, t_pred, np.exp(-log_scale))
+    e = _errors(np.swapaxes(motions.R, 1, 2), motions.t, R_pred, t_pred, _inverse_scale(motions, log_scale))
     return np.asarray((motions.whiten @ e[:, :, None])[:, :, 0])
 
 
 def linearize(motions: ScaledMotions, R: Array, p: Array, log_scale: Array) -> Linearized:
     """Linearise all motions at body poses R (M, 3, 3), p (M, 3) [m] and per-motion log scales (N,)."""
     R_bc, t_bc = motions.T_body_camera[:3, :3], motions.T_body_camera[:3, 3]
-    inverse_scale = np.exp(-log_scale)
+    inverse_scale = _inverse_scale(motions, log_scale)
     R_pred, t_pred, (R_ij, t_ij) = _predict(motions, R, p)
     R_meas_t = np.swapaxes(motions.R, 1, 2)
     e = _errors(R_meas_t, motions.t, R_pred, t_pred, inverse_scale)
@@ -130,6 +133,8 @@ def linearize(motions: ScaledMotions, R: Array, p: Array, log_scale: Array) -> L
     to_units = _times_constant(inverse_scale[:, None, None] * R_meas_t, R_bc.T)
     D = np.zeros((len(motions), 6, 14))
     D[:, 3:, 0] = -inverse_scale[:, None] * (R_meas_t @ t_pred[:, :, None])[:, :, 0]
+    if motions.held_log_scale is not None:
+        D[np.isfinite(motions.held_log_scale), :, 0] = 0.0
     D[:, :3, 7:10] = _times_constant(J_inverse, R_bc.T)
     np.matmul(-J_inverse, np.swapaxes(R_pred, 1, 2) @ R_bc.T, out=D[:, :3, 1:4])
     D[:, 3:, 1:4] = to_units @ se3.skew(t_ij + R_ij @ t_bc)
@@ -140,6 +145,12 @@ def linearize(motions: ScaledMotions, R: Array, p: Array, log_scale: Array) -> L
     D[:, :, 13] = -e
     columns = motions.whiten @ D
     return Linearized(columns, np.einsum("nk,nk->n", columns[:, :, 13], columns[:, :, 13]))
+
+
+def _inverse_scale(motions: ScaledMotions, log_scale: Array) -> Array:
+    """(N,) motion units per metre."""
+    held = motions.held_log_scale
+    return np.exp(-log_scale if held is None else -np.where(np.isnan(held), log_scale, held))
 
 
 def _predict(motions: ScaledMotions, R: Array, p: Array) -> tuple[Array, Array, tuple[Array, Array]]:

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from typing import Any
 
+import numpy as np
+
 from fusion.result import Refinement
 from vio import se3
 from vio.alignment import associate
@@ -35,6 +37,8 @@ def summarize(refinement: Refinement) -> dict[str, Any]:
         "camera_imu": r.camera_imu.to_dict(),
         "motions": {"used": r.motions_used, "rejected": len(r.rejected), "bridged": r.bridged,
                     "rotation_noise": r.motion_noise[0], "translation_noise": r.motion_noise[1]},
+        "rest": {"stretches": len(r.rest.span),
+                 "duration_s": float(np.diff(r.trajectory.t_s[r.rest.span], axis=1).sum())},
         "loops": {"proposed": r.loops.proposed, "accepted": int(r.loops.accepted.sum()),
                   "refused": dict(sorted(r.loops.refused.items()))},
         "time_offset_s": r.time_offset_s,
@@ -76,6 +80,8 @@ def sentences(summary: dict[str, Any]) -> str:
         f"motions: {summary['motions']['used']} used, {summary['motions']['rejected']} rejected",
     ]
     lines += [f"imu: {step['words']}; it was let go there" for step in summary["imu"]["bias_steps"]]
+    if summary["rest"]["stretches"]:
+        lines.append(f"rest: {rest_in_words(summary['rest'], summary['duration_s'])}")
     if summary["loops"]["proposed"]:
         lines.append(f"loops: {loops_in_words(summary['loops'])}")
     if "online" in summary:
@@ -92,3 +98,10 @@ def loops_in_words(loops: dict[str, Any]) -> str:
     count, refused = loops["accepted"], sorted(loops["refused"].items(), key=lambda item: (-item[1], item[0]))
     text = f"{count} of {loops['proposed']} pairs of frames that look alike were used as the same place seen again"
     return text + (": " + "; ".join(f"{n} not, {reason}" for reason, n in refused) if refused else "") + "."
+
+
+def rest_in_words(rest: dict[str, Any], duration_s: float) -> str:
+    """How long the capsule lay still."""
+    times = "once" if rest["stretches"] == 1 else f"{rest['stretches']} times"
+    return (f"the capsule lay still {times}, {rest['duration_s']:.0f} s in all "
+            f"({100 * rest['duration_s'] / duration_s:.0f} % of the time): IMU and motions agree.")

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusion.result import Refinement
-from fusion.summary import loops_in_words
+from fusion.summary import loops_in_words, rest_in_words
 
 Array = NDArray[np.float64]
 
@@ -147,6 +147,8 @@ def sentences(
     out.append(("IMU", _imu(refinement, *(mean_biases or own))))
     out.append(("Camera and IMU", _camera_imu(refinement)))
     out.append(("Motions", _motions(refinement)))
+    if (summary.get("rest") or {}).get("stretches"):
+        out.append(("Rest", _begun(rest_in_words(summary["rest"], summary["duration_s"]))))
     if (summary.get("loops") or {}).get("proposed"):
         out.append(("Loops", _begun(loops_in_words(summary["loops"]))))
     if within_3_sigma is not None:

@@ -30,6 +30,7 @@ from vio.simulation import (
 )
 from vio.simulation.anatomy import make_anatomy
 from vio.simulation.contact import find_contacts
+from vio.simulation.halts import Clock
 from vio.simulation.imu_synthesis import ImuBiases, corrupt
 from vio.simulation.path import moving_path
 from vio.simulation.scenario import START_T_NS
@@ -134,6 +135,44 @@ def test_gaussian_vibration_has_the_documented_size_and_stays_below_the_imu_nyqu
     assert power[np.fft.rfftfreq(len(t), 0.01) > 5].sum() < 0.01 * power.sum()
     knots = np.arange(0, 600, 1 / 8)
     assert np.abs(make_vibration("gaussian", 5, 600.0, 1)(knots)[0]).max() <= 0.5e-3 + 1e-12  # [-1, 1] × 5 × 0.1 mm
+
+
+# ---- halts -----------------------------------------------------------------------------------
+
+def test_a_capsule_that_halts_lies_still_and_then_goes_on_the_way_it_would_have_gone():
+    halts = [(5.0, 9.0), (12.0, 20.0)]
+    going = simulate("small-bowel", "collision", 3, 40.0, 4)
+    halting = simulate("small-bowel", "collision", 3, 40.0, 4, halts=halts)
+    for begin, end in halts:
+        there = halting.motion.evaluate(np.linspace(begin, end, 50))
+        assert np.ptp(there.T_world_body, axis=0).max() < 1e-12 and not there.gyro_rad_s.any()
+        assert not there.velocity_m_s.any()
+        t = halting.recording.imu_t_s
+        samples = halting.recording.imu.gyro_rad_s[(t > begin + 0.02) & (t < end - 0.02)]
+        assert samples.std(axis=0).max() < 1.2e-3  # the sensor's own noise is 0.8e-3
+    own = Clock(halts)(np.array([1.0, 10.3, 30.0]))[0]
+    np.testing.assert_allclose(halting.motion.evaluate(np.array([1.0, 10.3, 30.0])).T_world_body,
+                               going.motion.evaluate(own).T_world_body, atol=1e-9)
+    assert own[2] == pytest.approx(30 - 4 - 8 - 2 * 0.5)  # half a second more for each halt's slowing down
+    assert halting.recording.provenance["halts"] == [[5.0, 9.0], [12.0, 20.0]]
+
+
+def test_velocity_and_rates_of_a_halting_capsule_are_derivatives():
+    motion = simulate("colon", "peristalsis", 3, 20.0, 5, halts=[(6.0, 10.0)]).motion
+    t, h = np.linspace(5.3, 10.7, 200), 1e-4
+    before, now, after = (motion.evaluate(t + shift) for shift in (-h, 0.0, h))
+    moved = (after.T_world_body[:, :3, 3] - before.T_world_body[:, :3, 3]) / (2 * h)
+    np.testing.assert_allclose(moved, now.velocity_m_s, atol=1e-6)
+    np.testing.assert_allclose((after.velocity_m_s - before.velocity_m_s) / (2 * h), now.acceleration_m_s2, atol=1e-4)
+    R = before.T_world_body[:, :3, :3]
+    turned = se3.so3_log(np.swapaxes(R, 1, 2) @ after.T_world_body[:, :3, :3]) / (2 * h)
+    np.testing.assert_allclose(turned, now.gyro_rad_s, atol=1e-5)
+
+
+@pytest.mark.parametrize("halts", [[(5.0, 4.0)], [(5.0, 9.0), (9.5, 12.0)], [(12.0, 20.0), (5.0, 9.0)]])
+def test_halts_out_of_order_are_refused(halts):
+    with pytest.raises(SimulationError, match="halts"):
+        simulate("colon", "none", 0, 30.0, 5, halts=halts)
 
 
 # ---- motion and IMU --------------------------------------------------------------------------

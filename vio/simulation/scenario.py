@@ -21,6 +21,7 @@ from vio.recording import Recording, TruthState
 from vio.simulation.anatomy import Anatomy, make_anatomy
 from vio.simulation.cameras import MIROCAM
 from vio.simulation.contact import find_contacts
+from vio.simulation.halts import Clock, HaltingPath, HaltingVibration, Halts
 from vio.simulation.imu_synthesis import SIMULATED_IMU, ImuBiases, corrupt, draw_biases, ideal_imu
 from vio.simulation.motion import CapsuleMotion
 from vio.simulation.organs import ORGANS
@@ -62,6 +63,7 @@ class SimulationOptions(TypedDict, total=False):
     mode: str
     start: float | None
     wall_motion: float
+    halts: Halts
     camera: Camera
     accel_bias_sd_m_s2: float
     gyro_bias_sd_rad_s: float
@@ -87,6 +89,7 @@ def simulate(
     mode: str = "moving",
     start: float | None = None,
     wall_motion: float = 1.0,
+    halts: Halts = (),
     camera: Camera = MIROCAM,
     accel_bias_sd_m_s2: float = 0.2,
     gyro_bias_sd_rad_s: float = float(np.deg2rad(0.5)),
@@ -109,6 +112,7 @@ def simulate(
         mode: "moving", or "rest" for a capsule that lies still (the vibration still shakes it).
         start: where in the organ it starts, 0 its entrance, 1 its exit; None = drawn from the first 60 %.
         wall_motion: scale of the wall's contractions, 1 as in life, 0 none.
+        halts: (begin, end) [s] between which course and vibration of the capsule stand still, in order.
         camera: what renders the images.
         accel_bias_sd_m_s2: standard deviation of the first accelerometer bias, per axis.
         gyro_bias_sd_rad_s: standard deviation of the first gyro bias, per axis.
@@ -116,8 +120,8 @@ def simulate(
 
     Raises:
         SimulationError: an unknown organ, vibration, driving or mode, a level outside 0 to 5, a seed that is no
-            integer ≥ 0, a duration or rate that is not positive, an IMU below 5 Hz, a negative bias, or fewer
-            than 2 frames.
+            integer ≥ 0, a duration or rate that is not positive, an IMU below 5 Hz, a negative bias, halts that
+            overlap, or fewer than 2 frames.
     """
     level, seed = _check_scenario(organ, vibration, level, seed, driving, mode)
     _check_place(start, wall_motion)
@@ -132,7 +136,11 @@ def simulate(
     nominal = (resting_path(anatomy, end_s, rng) if mode == "rest"
                else moving_path(anatomy, driving, end_s, rng, start))
     contacts = find_contacts(anatomy, nominal, end_s) if vibration == "collision" and level > 0 else None
-    motion = CapsuleMotion(nominal, make_vibration(vibration, level, end_s, seed, contacts))
+    shaking = make_vibration(vibration, level, end_s, seed, contacts)
+    if len(halts):
+        clock = Clock(halts)
+        nominal, shaking = HaltingPath(nominal, clock), HaltingVibration(shaking, clock)
+    motion = CapsuleMotion(nominal, shaking)
     state = motion.evaluate(frame_t_s)
 
     rng = np.random.default_rng([seed, 3])
@@ -150,6 +158,8 @@ def simulate(
         "wall_motion": float(wall_motion),
         "accel_bias_sd_m_s2": float(accel_bias_sd_m_s2), "gyro_bias_sd_rad_s": float(gyro_bias_sd_rad_s),
     }
+    if len(halts):
+        provenance["halts"] = [[float(begin), float(end)] for begin, end in halts]
     recording = Recording(
         name=name or f"{organ}-{vibration}{level}-seed{seed}", frame_t_ns=frame_t_ns, imu=samples,
         calibration=Calibration(camera, T_BODY_CAMERA, noise), truth=Trajectory(frame_t_s, state.T_world_body),
