@@ -13,6 +13,7 @@ from learned.train_config import (
     MEASURED_BRANCH,
     MEASURED_FUSION,
     MEASURED_LENGTHS,
+    MEASURED_NEARNESS,
     TrainConfig,
     train_config,
 )
@@ -80,6 +81,9 @@ def config_of(options: Mapping[str, Any], taught: bool = False) -> TrainConfig:
         if "method" in decided:
             raise ConfigError(f"{Path(options['config']).name}: the method is decided by --method and its options; "
                               "leave it out")
-    decided = (MEASURED_LENGTHS if taught else {}) | decided
+    if taught:
+        decided = MEASURED_LENGTHS | decided
+        if decided["length_from"] == "refined" and getattr(method, "whole_image", False):
+            decided = {"nearness_weight": MEASURED_NEARNESS} | decided
     decided |= {key: options[key] for key in DIRECT if options.get(key) is not None}
     return train_config(method, **decided)

@@ -164,7 +164,7 @@ def test_the_command_line_teaches_and_goes_on_from_weights(written, tmp_path, ca
         main([*command, "--out", str(out), *more])
         decided = json.loads((out / "config.json").read_text())
         assert decided["length_from"] == "refined" and decided["unit_depth_weight"] == 0.07
-        assert "step_lengths" in (out / "train.csv").read_text().splitlines()[0]
+        assert {"step_lengths", "nearness"} <= set((out / "train.csv").read_text().splitlines()[0].split(","))
         stem: torch.Tensor = torch.load(out / "checkpoint.pt", weights_only=True)["model"]["depth.encoder.conv1.weight"]
         return stem
 
