@@ -13,6 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 
 from learned.losses.consistency import Consistency
@@ -32,6 +33,9 @@ TEMPERATURE = 0.05
 KNOWN_SD = 0.1
 """Spread of the likely factors at which a search counts half. With these two, on calibration recordings: found to 0.055
 where the network is off by 0.114, and to 0.25 where it takes a wall for much farther than it is, by 0.75."""
+
+SMALL = 0.15
+"""Log factors that a search errs by anyway."""
 
 
 @dataclass(frozen=True)
@@ -67,7 +71,10 @@ def search_nearness(snippet: Snippet, step_weight: Mapping[tuple[int, int], Tens
 
 
 def nearness_difference(nearness: Tensor, found: FoundNearness) -> Tensor:
-    """Weighted mean |log| of the factors that were found, with a gradient for the number that brings everything nearer.
+    """Weighted mean of the factors that were found, with a gradient for the number that brings everything nearer.
+
+    Log factors within `SMALL` count by their square: by their size, all frames that are nearly right would pull as hard
+    as those that are far off, and the number was measured to jump about.
 
     Args:
         nearness: (B, F) the network's numbers, which add to the log of inverse depth.
@@ -75,7 +82,8 @@ def nearness_difference(nearness: Tensor, found: FoundNearness) -> Tensor:
     """
     nearness = full_precision(nearness)
     weight = found.weight.to(nearness.dtype)
-    apart = (nearness.detach() - nearness - found.log_factor.to(nearness.dtype)).abs()
+    apart = F.smooth_l1_loss(nearness.detach() - nearness, found.log_factor.to(nearness.dtype), reduction="none",
+                             beta=SMALL)
     return (weight * apart).sum() / weight.sum().clamp(min=1e-6)
 
 

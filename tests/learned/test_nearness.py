@@ -8,7 +8,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from learned.losses.consistency import Consistency
-from learned.losses.nearness import KNOWN_SD, FoundNearness, nearness_difference, search_nearness
+from learned.losses.nearness import KNOWN_SD, SMALL, FoundNearness, nearness_difference, search_nearness
 from learned.losses.step_lengths import told_by
 from learned.methods import assemble, method_config
 from learned.objective import Objective
@@ -54,7 +54,8 @@ def test_the_number_learns_what_was_found_and_nothing_else_does():
     nearness = torch.zeros(2, 3, dtype=torch.float64, requires_grad=True)
     found = FoundNearness(torch.tensor([[-0.5, 0.2, 0.7], [0.0, 0.0, -0.1]]), torch.tensor([[1, 0.5, 0], [0, 0, 1]]))
     loss = nearness_difference(nearness, found)
-    assert loss.item() == pytest.approx((0.5 + 0.5 * 0.2 + 0.1) / 2.5)
+    half = SMALL / 2
+    assert loss.item() == pytest.approx((0.5 - half + 0.5 * (0.2 - half) + 0.1**2 / (2 * SMALL)) / 2.5)
     loss.backward()
     nearer = -nearness.grad.sign()  # where descent goes: nearer where depth wants to be smaller
     assert nearer.tolist() == [[1, -1, 0], [0, 0, 1]]
