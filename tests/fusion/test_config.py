@@ -75,7 +75,7 @@ def test_whatever_is_read_it_is_a_configuration_or_one_line(value):
 
 
 @pytest.mark.parametrize(("values", "words"), [
-    ({"estimatr": "ekf"}, "unknown key 'estimatr'; known are estimator, robust, scale, solver, initial"),
+    ({"estimatr": "ekf"}, "unknown key 'estimatr'; known are estimator, robust, scale, rest, solver, initial"),
     ({"robust": {"hubber": 1}}, "unknown key 'robust.hubber'; known are huber, gate"),
     ({3: 1}, "unknown key '3'"),
     ({"estimator": "kalman"}, "estimator is 'kalman'; choose one of auto, graph, ekf"),
