@@ -21,7 +21,7 @@ from scipy.signal import welch
 
 from fusion.problem import Problem, with_accelerometer
 from vio import se3
-from vio.imu import GRAVITY_M_S2, ImuPieces
+from vio.imu import GRAVITY_M_S2, ImuPieces, split_at_frames
 
 Array = NDArray[np.float64]
 
@@ -71,12 +71,13 @@ def without_body_motion(problem: Problem, R_world_body: Array, p_world_m: Array,
     span = float(problem.t_s[-1] - problem.t_s[0])
     if span < SHORTEST_S or trusted.sum() < 3:
         return problem, BodyMotion(0.0, 0.0, 0.0)
-    owner = np.repeat(np.arange(len(problem) - 1), np.diff(problem.pieces.first))
-    R = _piece_attitudes(problem.pieces, R_world_body, gyro_bias_rad_s, owner)
-    t = _piece_centres(problem, owner)
-    felt = (R @ (problem.pieces.accel_m_s2 - accel_bias_m_s2[owner])[:, :, None])[:, :, 0] - [0, 0, GRAVITY_M_S2]
+    pieces = split_at_frames(problem.samples, problem.imu_t_s, problem.t_s, problem.gyro_bias_rad_s, ramps=False)
+    owner = np.repeat(np.arange(len(problem) - 1), np.diff(pieces.first))
+    R = _piece_attitudes(pieces, R_world_body, gyro_bias_rad_s, owner)
+    t = _piece_centres(problem, pieces, owner)
+    felt = (R @ (pieces.accel_m_s2 - accel_bias_m_s2[owner])[:, :, None])[:, :, 0] - [0, 0, GRAVITY_M_S2]
     residual = np.where(problem.imu_usable[owner, None], felt - _seen(problem, p_world_m, trusted, t), 0.0)
-    rate_hz = 1.0 / float(np.median(problem.pieces.dt_s))
+    rate_hz = 1.0 / float(np.median(pieces.dt_s))
     grid = np.arange(problem.t_s[0], problem.t_s[-1], 1.0 / rate_hz)
     uniform = CubicSpline(t, residual)(grid)
     lines = _lines(uniform, rate_hz)
@@ -86,7 +87,7 @@ def without_body_motion(problem: Problem, R_world_body: Array, p_world_m: Array,
     inside = (problem.imu_t_s >= grid[0]) & (problem.imu_t_s <= grid[-1])
     at = problem.imu_t_s[inside]
     k = np.clip(np.searchsorted(t, at), 0, len(t) - 1)  # the nearest pieces' attitude, carried to the stamp
-    turned = R[k] @ se3.so3_exp(problem.pieces.gyro_rad_s[k] * (at - t[k] + 0.5 * problem.pieces.dt_s[k])[:, None])
+    turned = R[k] @ se3.so3_exp(pieces.gyro_rad_s[k] * (at - t[k] + 0.5 * pieces.dt_s[k])[:, None])
     unseen = CubicSpline(grid, lines)(at)
     accel = problem.samples.accel_m_s2.copy()
     accel[inside] -= (np.swapaxes(turned, 1, 2) @ unseen[:, :, None])[:, :, 0]
@@ -104,10 +105,10 @@ def _piece_attitudes(pieces: ImuPieces, R_world_body: Array, gyro_bias: Array, o
     return R
 
 
-def _piece_centres(problem: Problem, owner: NDArray[np.int64]) -> Array:
-    dt = problem.pieces.dt_s
+def _piece_centres(problem: Problem, pieces: ImuPieces, owner: NDArray[np.int64]) -> Array:
+    dt = pieces.dt_s
     ends = np.cumsum(dt)
-    begun = np.concatenate([[0.0], ends])[problem.pieces.first[:-1]]
+    begun = np.concatenate([[0.0], ends])[pieces.first[:-1]]
     centres: Array = problem.t_s[owner] + ends - 0.5 * dt - begun[owner]
     return centres
 

@@ -120,7 +120,7 @@ def check_coverage(imu_t_s: Array, frame_t_s: Array) -> None:
 
 
 def split_at_frames(samples: ImuSamples, imu_t_s: ArrayLike, frame_t_s: ArrayLike,
-                    gyro_bias_rad_s: ArrayLike = (0.0, 0.0, 0.0)) -> ImuPieces:
+                    gyro_bias_rad_s: ArrayLike = (0.0, 0.0, 0.0), *, ramps: bool = True) -> ImuPieces:
     """Cut every sample's cell at the frame times, and turn each force into the axes at its piece's start.
 
     A piece takes its sample's average, carried along the signal's slope from the sample's stamp to the
@@ -136,6 +136,7 @@ def split_at_frames(samples: ImuSamples, imu_t_s: ArrayLike, frame_t_s: ArrayLik
         frame_t_s: (M+1,) frame times [s], strictly increasing, covered by the samples.
         gyro_bias_rad_s: (3,) what is known of the gyro's bias; it is left out of that rotation (0.5 deg/s would
             tilt every force by 0.006 deg at 40 Hz) but stays in the pieces' rates.
+        ramps: for forces that are integrated; without, they are what was felt.
 
     Raises:
         ImuError: the samples do not reach over all frames.
@@ -149,8 +150,9 @@ def split_at_frames(samples: ImuSamples, imu_t_s: ArrayLike, frame_t_s: ArrayLik
     rate = gyro - np.asarray(gyro_bias_rad_s)
     turn = se3.so3_exp(rate * (0.5 * dt)[:, None])
     accel = (turn @ force[:, :, None])[:, :, 0]
-    jerk = (turn @ (slope + np.cross(rate, force))[:, :, None])[:, :, 0]
-    accel = accel + _slopes_as_constants(jerk, dt, interval, m)
+    if ramps:
+        jerk = (turn @ (slope + np.cross(rate, force))[:, :, None])[:, :, 0]
+        accel = accel + _slopes_as_constants(jerk, dt, interval, m)
     first = np.searchsorted(interval, np.arange(m + 1))
     return ImuPieces(gyro, accel, dt, first.astype(np.int64), _longest_spacing(t, frames))
 
