@@ -67,7 +67,7 @@ def inertial_steps(problem: Problem, accel_inflation: float = 1.0) -> InertialSt
         pose = [UNKNOWN] * 2 if measured[k] else [1 / turn_sd, 1 / (BLIND_SPEED_M_S * dt)]
         steps.whiten[k] = np.diag(np.repeat([pose[0], 1 / (GAP_VELOCITY_SD_M_S_RTS * np.sqrt(dt)), pose[1]], 3))
         steps.free_fall[k] = 0.0
-    return steps if problem.bias_released is None else steps.released(problem.bias_released)
+    return steps if problem.bias_slack is None else steps.loosened(problem.bias_slack)
 
 
 def chain_start(problem: Problem, config: RefineConfig, log_scale: float,

@@ -127,7 +127,7 @@ def chunked_start(problem: Problem, config: RefineConfig, log_scale: float, acce
 def _preintegrate(problem: Problem, bias: Array, accel_inflation: float,
                   span: tuple[int, int]) -> list[gtsam.PreintegratedCombinedMeasurements]:
     return preintegrate(problem.pieces, problem.noise, bias[:3], bias[3:], problem.accel_inflation * accel_inflation,
-                        problem.gyro_inflation, span, problem.bias_released)
+                        problem.gyro_inflation, span, problem.bias_slack)
 
 
 def first_guess(problem: Problem, motions: ScaledMotions, rotations: Array, initial: InitialConfig, log_scale: float,

@@ -1,0 +1,104 @@
+"""Where the IMU's biases change by more than their random walk: letting them do so there and nowhere else.
+
+A stretch whose inertial data disagree, or whose biases change by more than their random walk allows, is looked at
+alone. Steps of the biases explain it, or biases that wander more all along it, or nothing. In a recording of a single
+stretch nothing else tells how much is wandering, and the scale policy judges.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from fusion.bias_steps import JUMP_SD, steps_of
+from fusion.bias_wander import BiasWander, joined, wander_of
+from fusion.config import RefineConfig
+from fusion.engine import Begin
+from fusion.problem import Problem
+from fusion.result import BiasStep
+from fusion.scale import CALM_CHI2, Segments
+from fusion.stretch_alone import STRAINED, StretchAlone, bias_walked, strain_of
+from fusion.stretches import Stretch
+from vio.errors import EstimationError
+
+OVER_OTHERS = 1.5
+"""Inertial chi² of a stretch over the median of all at which it is looked at; alone, `CALM_CHI2` decides."""
+MOST_UNEXPLAINED = 3
+"""Stretches that nothing explains, after which the recording as a whole is at fault and no more is looked for."""
+
+
+@dataclass(frozen=True)
+class BiasChanges:
+    """Where the biases change by more than their random walk."""
+
+    steps: tuple[BiasStep, ...] = ()
+    wanders: tuple[BiasWander, ...] = ()
+
+    def __bool__(self) -> bool:
+        return bool(self.steps or self.wanders)
+
+    def let_go(self, problem: Problem) -> Problem:
+        """The problem with its biases free to change there."""
+        if not self:
+            return problem
+        slack = np.zeros((len(problem) - 1, 2))
+        for wander in self.wanders:
+            slack[wander.first:wander.last] = wander.slack(problem)
+        for step in self.steps:
+            slack[step.first_frame:step.last_frame] = JUMP_SD
+        return replace(problem, bias_slack=slack)
+
+    def words(self, problem: Problem) -> list[str]:
+        """A sentence for every run of stretches whose biases wander; steps are told by the IMU's conclusion."""
+        return [wander.in_words(problem.first_frame, len(problem) - 1) for wander in joined(self.wanders)]
+
+
+def find_bias_changes(problem: Problem, config: RefineConfig, segments: Segments, start: Begin,
+                      suspects: Sequence[Stretch]) -> BiasChanges:
+    """What explains some stretches of a start.
+
+    Args:
+        problem: the checked problem.
+        config: of the refinement.
+        segments: of the log scales.
+        start: of a chain.
+        suspects: stretches to look at.
+    """
+    steps: list[BiasStep] = []
+    wanders: list[BiasWander] = []
+    unexplained = 0
+    for stretch in suspects:
+        explained = _explained(problem, config, segments, start, stretch)
+        if explained is None:
+            unexplained += 1
+        elif isinstance(explained, BiasWander):
+            wanders.append(explained)
+        else:
+            steps += [step for step in explained if all(step.first_frame > old.last_frame for old in steps)]
+        if unexplained > MOST_UNEXPLAINED:
+            break
+    return BiasChanges(tuple(steps), tuple(wanders))
+
+
+def _explained(problem: Problem, config: RefineConfig, segments: Segments, start: Begin,
+               stretch: Stretch) -> Sequence[BiasStep] | BiasWander | None:
+    """Steps, none where the stretch alone needs no explaining; or biases that wander; None where neither explains."""
+    last = min(stretch.last + config.solver.overlap_frames, len(problem) - 1)
+    alone = StretchAlone(problem, config, segments, start.model.steps, start.values, stretch.first, last)
+    try:
+        steps = steps_of(alone, problem)
+        more = wander_of(alone) if steps is None and len(start.stretches) > 1 else None
+    except EstimationError:  # nothing is believed of a stretch that cannot be solved
+        return None
+    return steps if more is None else BiasWander(stretch.first, stretch.last, *more)
+
+
+def suspect_stretches(start: Begin) -> list[Stretch]:
+    """Stretches of a chain's start whose inertial data disagree, or whose biases strain."""
+    chi2 = [stretch.imu_chi2 for stretch in start.stretches]
+    limit = CALM_CHI2 if len(chi2) == 1 else max(CALM_CHI2, OVER_OTHERS * float(np.median(chi2)))
+    walked = bias_walked(start.values) / start.model.steps.bias_walk_sd
+    return [stretch for stretch in start.stretches
+            if stretch.imu_chi2 > limit or strain_of(walked[stretch.first:stretch.last - 1]).max() > STRAINED]
