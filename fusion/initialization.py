@@ -156,7 +156,7 @@ def first_guess(problem: Problem, motions: ScaledMotions, rotations: Array, init
 
 
 def _followed(problem: Problem, motions: ScaledMotions, rotations: Array, k0: int) -> Array:
-    """The gyro's rotations; where biases change beyond their random walk, with the bias that the motions show nearby."""
+    """The gyro's rotations; where biases may change by more than their random walk, with the bias the motions show."""
     here = slice(k0, k0 + len(rotations))
     if problem.bias_slack is None or not problem.bias_slack[here].any():
         return rotations
