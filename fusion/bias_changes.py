@@ -12,12 +12,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from fusion.bias_steps import JUMP_SD, steps_of
-from fusion.bias_wander import BiasWander, joined, wander_of
+from fusion.bias_steps import JUMP_SD, Stepped, steps_of
+from fusion.bias_wander import slack_of, wander_of
 from fusion.config import RefineConfig
 from fusion.engine import Begin
 from fusion.problem import Problem
-from fusion.result import BiasStep
+from fusion.result import BiasStep, BiasWander
 from fusion.scale import CALM_CHI2, Segments
 from fusion.stretch_alone import STRAINED, StretchAlone, bias_walked, strain_of
 from fusion.stretches import Stretch
@@ -45,14 +45,23 @@ class BiasChanges:
             return problem
         slack = np.zeros((len(problem) - 1, 2))
         for wander in self.wanders:
-            slack[wander.first:wander.last] = wander.slack(problem)
+            slack[wander.first_frame:wander.last_frame] = slack_of(wander, problem)
         for step in self.steps:
             slack[step.first_frame:step.last_frame] = JUMP_SD
         return replace(problem, bias_slack=slack)
 
-    def words(self, problem: Problem) -> list[str]:
-        """A sentence for every run of stretches whose biases wander; steps are told by the IMU's conclusion."""
-        return [wander.in_words(problem.first_frame, len(problem) - 1) for wander in joined(self.wanders)]
+    @property
+    def told_wanders(self) -> tuple[BiasWander, ...]:
+        """Stretches that follow each other as one that wanders as much as the worst of them."""
+        out: list[BiasWander] = []
+        for wander in self.wanders:
+            if out and out[-1].last_frame == wander.first_frame:
+                old = out.pop()
+                wander = replace(wander, first_frame=old.first_frame, start_s=old.start_s,
+                                 accel_times=max(old.accel_times, wander.accel_times),
+                                 gyro_times=max(old.gyro_times, wander.gyro_times))
+            out.append(wander)
+        return tuple(out)
 
 
 def find_bias_changes(problem: Problem, config: RefineConfig, segments: Segments, start: Begin,
@@ -76,23 +85,24 @@ def find_bias_changes(problem: Problem, config: RefineConfig, segments: Segments
         elif isinstance(explained, BiasWander):
             wanders.append(explained)
         else:
-            steps += [step for step in explained if all(step.first_frame > old.last_frame for old in steps)]
+            steps += [step for step in explained.steps if all(step.first_frame > old.last_frame for old in steps)]
         if unexplained > MOST_UNEXPLAINED:
             break
     return BiasChanges(tuple(steps), tuple(wanders))
 
 
 def _explained(problem: Problem, config: RefineConfig, segments: Segments, start: Begin,
-               stretch: Stretch) -> Sequence[BiasStep] | BiasWander | None:
-    """Steps, none where the stretch alone needs no explaining; or biases that wander; None where neither explains."""
+               stretch: Stretch) -> Stepped | BiasWander | None:
+    """Steps, or biases that wander where steps are not sure to explain the stretch; None where neither does."""
     last = min(stretch.last + config.solver.overlap_frames, len(problem) - 1)
     alone = StretchAlone(problem, config, segments, start.model.steps, start.values, stretch.first, last)
     try:
-        steps = steps_of(alone, problem)
-        more = wander_of(alone) if steps is None and len(start.stretches) > 1 else None
+        stepped = steps_of(alone, problem)
+        if len(start.stretches) == 1 or (stepped is not None and stepped.sure):
+            return stepped
+        return wander_of(alone, problem, stretch) or stepped
     except EstimationError:  # nothing is believed of a stretch that cannot be solved
         return None
-    return steps if more is None else BiasWander(stretch.first, stretch.last, *more)
 
 
 def suspect_stretches(start: Begin) -> list[Stretch]:

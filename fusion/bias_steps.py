@@ -10,6 +10,8 @@ motions agree: a body that moves unseen, or a sensor that warms up, does not com
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -30,12 +32,24 @@ LOOSENED = (1.0, 4.0, 16.0)
 """How many strains the biases may wander at first: what a stretch makes of a step that it cannot follow says little."""
 LET_GO, WIDEST = 2, 6
 """Links between frames over which the biases are let go at least; how many more on either side at most."""
+CALM_STRAIN = 2.5
+"""Beside steps, at most, where a slow change is no other explanation: cut at a step, it leaves 3."""
 AS_GOOD = 10.0
 """Cost beyond the least at which the step may lie elsewhere as well."""
 
 
-def steps_of(alone: StretchAlone, problem: Problem) -> list[BiasStep] | None:
-    """The steps that explain a stretch, none where it needs no explaining; None where steps do not explain it."""
+@dataclass(frozen=True)
+class Stepped:
+    """What steps make of a stretch."""
+
+    steps: tuple[BiasStep, ...]
+    """None where it needs no explaining."""
+    sure: bool
+    """Whether every step has its place, and beside them the biases are as calm as sound ones."""
+
+
+def steps_of(alone: StretchAlone, problem: Problem) -> Stepped | None:
+    """The steps that explain a stretch; None where steps do not."""
     jumps = np.zeros((len(alone.steps), 2))
     windows: list[tuple[int, int]] = []
     here = alone.solved(jumps)
@@ -56,7 +70,9 @@ def steps_of(alone: StretchAlone, problem: Problem) -> list[BiasStep] | None:
         windows.append(window)
         jumps[slice(*window)] = JUMP_SD
         here = alone.solved(jumps)
-    return [_concluded(alone, problem, here, window) for window in sorted(windows)]
+    placed = all(last - first < LET_GO + 2 * WIDEST for first, last in windows)
+    return Stepped(tuple(_concluded(alone, problem, here, window) for window in sorted(windows)),
+                   not windows or (placed and bool(here.strain.max() <= CALM_STRAIN)))
 
 
 def _placed(alone: StretchAlone, slack: Array, wandering: Solved) -> tuple[tuple[int, int], float]:

@@ -192,7 +192,6 @@ class GraphEstimator:
         if suspects:
             with self.stages("bias_changes"):
                 self.bias_changes = find_bias_changes(self.problem, self.config, self.segments, start, suspects)
-            self.notes += self.bias_changes.words(self.problem)
         if suspects and self.bias_changes:
             self.problem = self.bias_changes.let_go(self.problem)
             start = self._start(log_scale, 1.0)
@@ -340,4 +339,4 @@ class GraphEstimator:
                 joint, T, assumed, T_body_camera, np.random.default_rng(SEED + 1))
         return Estimate(T, cov, states.v, states.gyro_bias, states.accel_bias, log_scale, log_scale_sd, conclusion,
                         final.rejected, fixed_chi2, inflation, joint, tuple(self.notes),
-                        bias_steps=self.bias_changes.steps)
+                        bias_steps=self.bias_changes.steps, bias_wanders=self.bias_changes.told_wanders)
