@@ -147,7 +147,7 @@ def test_stretches_that_follow_each_other_are_told_as_one():
 
 def test_a_chunk_starts_from_the_bias_that_the_motions_show(made):
     """Held at one bias, the gyro of a sensor that warms up would have turned the chunk's end away."""
-    recording, problem, _ = prepare(warming(made.recording, 300.0), made.motions)
+    recording, problem, _ = prepare(warming(made.recording, 100.0, gyro=4.0), made.motions)
     wandering = replace(problem, bias_slack=np.ones((len(problem) - 1, 2)))
     steps, truth = inertial_steps(problem), recording.truth_at_frames().rotations
     turned = []
