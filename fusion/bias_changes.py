@@ -14,6 +14,8 @@ import numpy as np
 
 from fusion.bias_steps import JUMP_SD, Stepped, steps_of
 from fusion.bias_wander import slack_of, wander_of
+from fusion.chain_start import followed_start
+from fusion.chain_state import ChainState
 from fusion.config import RefineConfig
 from fusion.engine import Begin
 from fusion.problem import Problem
@@ -94,13 +96,18 @@ def find_bias_changes(problem: Problem, config: RefineConfig, segments: Segments
 def _explained(problem: Problem, config: RefineConfig, segments: Segments, start: Begin,
                stretch: Stretch) -> Stepped | BiasWander | None:
     """Steps, or biases that wander where steps are not sure to explain the stretch; None where neither does."""
-    last = min(stretch.last + config.solver.overlap_frames, len(problem) - 1)
-    alone = StretchAlone(problem, config, segments, start.model.steps, start.values, stretch.first, last)
+    first, last = stretch.first, min(stretch.last + config.solver.overlap_frames, len(problem) - 1)
+    steps = start.model.steps
+
+    def alone(state: ChainState) -> StretchAlone:
+        return StretchAlone(problem, config, segments, steps, state, first, last)
+
     try:
-        stepped = steps_of(alone, problem)
+        stepped = steps_of(alone(start.values.part(first, last + 1)), problem)
         if len(start.stretches) == 1 or (stepped is not None and stepped.sure):
             return stepped
-        return wander_of(alone, problem, stretch) or stepped
+        followed = alone(followed_start(problem, config, steps.part(first, last), first))
+        return wander_of(followed, problem, stretch) or stepped
     except EstimationError:  # nothing is believed of a stretch that cannot be solved
         return None
 

@@ -5,6 +5,8 @@ Chaining a whole examination lets the tilt drift until Gauss-Newton diverges; ch
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -103,6 +105,12 @@ def chain_start(problem: Problem, config: RefineConfig, log_scale: float,
     if not any(np.isfinite(stretch.imu_chi2) for stretch in stretches):
         raise EstimationError(stretches[0].reason or "graph: no chunk could be solved")
     return ChainState.joined(parts), anchors[0], stretches
+
+
+def followed_start(problem: Problem, config: RefineConfig, steps: InertialSteps, first: int) -> ChainState:
+    """First values of the frames that steps from frame `first` on join, if their biases change as the motions show."""
+    changing = replace(problem, bias_slack=np.ones((len(problem) - 1, 2)))
+    return _chunk(changing, config, problem.scale_log_mean, steps, first, None)[1]
 
 
 def _chunk(problem: Problem, config: RefineConfig, log_scale: float, steps: InertialSteps, k0: int,

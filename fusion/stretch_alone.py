@@ -61,13 +61,14 @@ class StretchAlone:
 
     def __init__(self, problem: Problem, config: RefineConfig, segments: Segments, steps: InertialSteps,
                  state: ChainState, first: int, last: int) -> None:
+        """`state` holds the frames `first` to `last`, where the solution begins."""
         self.first, self.usable = first, int(problem.imu_usable[first:last].sum())
         self.steps, m = steps.part(first, last), problem.motions
         inside = (m.i >= first) & (m.j <= last) & (m.j - m.i <= LONGEST_REACH)
         motions = m.select(inside, first_node=first)
         self.scale = None if config.scale.policy == "fixed" or problem.scale_log_sd == 0 else \
             _scales(problem, segments, config.scale.walk_per_sqrt_s, first, last)
-        self.start = replace(state.part(first, last + 1), log_scale=np.zeros(0))
+        self.start = replace(state, log_scale=np.zeros(0))
         if self.scale is not None:
             self.start = replace(self.start, log_scale=np.full(len(self.scale.step_sd) + 1, self.scale.log_mean))
         T = self.start.T_world_body[0]
@@ -75,9 +76,9 @@ class StretchAlone:
         self.gate = config.robust.gate
         self.term = _term(motions, self.scale, problem.scale_log_mean, config.robust.huber)
 
-    def solved(self, slack: Array) -> Solved:
+    def solved(self, slack: Array, start: ChainState | None = None) -> Solved:
         """The stretch whose biases may change by a slack (K, 2) beyond their random walk (`Problem.bias_slack`)."""
-        return self._solved(self.steps.loosened(slack), self.start, ITERATIONS, TOLERANCE)
+        return self._solved(self.steps.loosened(slack), start or self.start, ITERATIONS, TOLERANCE)
 
     def tried(self, slack: Array, start: ChainState) -> Solved:
         """The same, roughly, from a start that is close."""
