@@ -8,6 +8,7 @@ stretch nothing else tells how much is wandering, and the scale policy judges.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -102,14 +103,15 @@ def _explained(problem: Problem, config: RefineConfig, segments: Segments, start
     def alone(state: ChainState) -> StretchAlone:
         return StretchAlone(problem, config, segments, steps, state, first, last)
 
-    try:
+    stepped: Stepped | None = None
+    wander: BiasWander | None = None
+    with suppress(EstimationError):  # nothing is believed of what cannot be solved
         stepped = steps_of(alone(start.values.part(first, last + 1)), problem)
-        if len(start.stretches) == 1 or (stepped is not None and stepped.sure):
-            return stepped
-        followed = alone(followed_start(problem, config, steps.part(first, last), first))
-        return wander_of(followed, problem, stretch) or stepped
-    except EstimationError:  # nothing is believed of a stretch that cannot be solved
-        return None
+    if len(start.stretches) == 1 or (stepped is not None and stepped.sure):
+        return stepped
+    with suppress(EstimationError):
+        wander = wander_of(alone(followed_start(problem, config, steps.part(first, last), first)), problem, stretch)
+    return wander or stepped
 
 
 def suspect_stretches(start: Begin) -> list[Stretch]:

@@ -21,8 +21,8 @@ ROUNDS = 8
 """Solutions, after each of which one sensor's bias may wander more by half its strain: held, it does not show it all.
 The gyro's comes first. The motions measure it, so that it cannot stand in for the accelerometer's; the other way round
 a loose accelerometer hides that the gyro's bias wanders."""
-MOST_AT_ONCE = 100.0
-"""Times more, after one solution: one that was far from converging overstates its strain."""
+MOST_TIMES = 1000.0
+"""As much as the biases may wander at most: what needs more is no sensor's bias."""
 ACCEL, GYRO = 0, 1
 AT_FIRST = np.array([100.0, 1000.0])
 """How many times as much the biases may wander in the solution near which all others are looked for."""
@@ -42,9 +42,9 @@ def wander_of(alone: StretchAlone, problem: Problem, stretch: Stretch) -> BiasWa
         here = alone.solved(alone.slack(more), near)
         strain = here.sensor_strain
         if strain.max() <= STRAINED:
-            found = here.agrees and more.max() > 1
+            found = here.agrees and alone.is_plausible(here) and more.max() > 1
             start_s, end_s = (float(problem.t_s[node]) for node in (stretch.first, stretch.last))
             return BiasWander(stretch.first, stretch.last, start_s, end_s, *map(float, more)) if found else None
         sensor = GYRO if strain[GYRO] > STRAINED else ACCEL
-        more[sensor] *= min(strain[sensor] / 2, MOST_AT_ONCE)
+        more[sensor] = min(more[sensor] * strain[sensor] / 2, MOST_TIMES)
     return None

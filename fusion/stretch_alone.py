@@ -19,7 +19,7 @@ from fusion.config import RefineConfig
 from fusion.graph import first_anchor
 from fusion.inertial import InertialSteps
 from fusion.problem import Problem
-from fusion.scale import CALM_CHI2, PLAUSIBLE_REJECTED, Segments, imu_chi2
+from fusion.scale import CALM_CHI2, PLAUSIBLE_REJECTED, PLAUSIBLE_SDS, Segments, imu_chi2
 from fusion.scaled_motion import ScaledMotions
 from fusion.solve import MotionTerm, Solution
 
@@ -95,6 +95,13 @@ class StretchAlone:
         return Solved(model, found, cost, imu_chi2(found.native_cost, self.usable),
                        strain_of(bias_walked(found.values) / steps.bias_walk_sd),
                        float(np.mean(found.squared_norm > self.gate)))
+
+    def is_plausible(self, done: Solved) -> bool:
+        """Whether scale stayed where its prior lets it be."""
+        if self.scale is None:
+            return True
+        moved = float(done.solution.values.log_scale.mean()) - self.scale.log_mean
+        return abs(moved) <= PLAUSIBLE_SDS * self.scale.log_sd
 
     def step_over(self, done: Solved, first: int, last: int) -> tuple[Array, Array]:
         """Change (6,) of accelerometer and gyro bias from frame `first` to `last` of the stretch, and its sd."""
