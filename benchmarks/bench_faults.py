@@ -138,7 +138,7 @@ def outcome(case: Case) -> list[str]:
     said = [refined.fallback_reason, f"scale {refined.scale.policy}: {refined.scale.reason}",
             refined.camera_imu.reason if refined.camera_imu.applied else None,
             f"{len(refined.imu.gaps)} hole in the IMU" if refined.imu.gaps else None,
-            *(step.in_words() for step in refined.imu.bias_steps)]
+            *(change.in_words() for change in (*refined.imu.bias_steps, *refined.imu.bias_wanders))]
     consistency = float(np.nanmean(nees(refined.trajectory, truth)))
     return [*(f"{error:.1f}" for error in errors), f"{consistency:.2f}", f"{cpu_s:.1f}",
             "; ".join(text for text in said if text)]

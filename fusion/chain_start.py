@@ -5,6 +5,8 @@ Chaining a whole examination lets the tilt drift until Gauss-Newton diverges; ch
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -67,7 +69,7 @@ def inertial_steps(problem: Problem, accel_inflation: float = 1.0) -> InertialSt
         pose = [UNKNOWN] * 2 if measured[k] else [1 / turn_sd, 1 / (BLIND_SPEED_M_S * dt)]
         steps.whiten[k] = np.diag(np.repeat([pose[0], 1 / (GAP_VELOCITY_SD_M_S_RTS * np.sqrt(dt)), pose[1]], 3))
         steps.free_fall[k] = 0.0
-    return steps if problem.bias_released is None else steps.released(problem.bias_released)
+    return steps if problem.bias_slack is None else steps.loosened(problem.bias_slack)
 
 
 def chain_start(problem: Problem, config: RefineConfig, log_scale: float,
@@ -103,6 +105,12 @@ def chain_start(problem: Problem, config: RefineConfig, log_scale: float,
     if not any(np.isfinite(stretch.imu_chi2) for stretch in stretches):
         raise EstimationError(stretches[0].reason or "graph: no chunk could be solved")
     return ChainState.joined(parts), anchors[0], stretches
+
+
+def followed_start(problem: Problem, config: RefineConfig, steps: InertialSteps, first: int) -> ChainState:
+    """First values of the frames that steps from frame `first` on join, if their biases change as the motions show."""
+    changing = replace(problem, bias_slack=np.ones((len(problem) - 1, 2)))
+    return _chunk(changing, config, problem.scale_log_mean, steps, first, None)[1]
 
 
 def _chunk(problem: Problem, config: RefineConfig, log_scale: float, steps: InertialSteps, k0: int,

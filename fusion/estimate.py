@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from fusion.joint import SEED, JointSamples, chain_samples, stretch_directions, with_assumed_scale
 from fusion.problem import Problem
-from fusion.result import NO_REST, BiasStep, LoopConclusion, RestConclusion, ScaleConclusion
+from fusion.result import NO_REST, BiasStep, BiasWander, LoopConclusion, RestConclusion, ScaleConclusion
 from vio import se3
 from vio.motions import RelativeMotions, chain_motions
 
@@ -47,6 +47,8 @@ class Estimate:
     """What became of the loops; None where none was asked for, or the estimator takes none."""
     bias_steps: tuple[BiasStep, ...] = ()
     """Where the IMU's biases stepped."""
+    bias_wanders: tuple[BiasWander, ...] = ()
+    """Where they wander more than the noise card says."""
     rest: RestConclusion = NO_REST
     """Where the capsule lay still; nothing where the estimator does not ask."""
     translation_noise: float = 1.0

@@ -16,7 +16,6 @@ from numpy.typing import NDArray
 
 from fusion.chain_state import ChainState
 from fusion.config import InitialConfig
-from fusion.preintegration import JUMP_SD
 from fusion.problem import Problem
 
 Array = NDArray[np.float64]
@@ -99,8 +98,8 @@ def _add_gap_link(graph: gtsam.NonlinearFactorGraph, problem: Problem, k: int,
     dt, noise = float(problem.dt_s[k]), problem.noise
     root = np.sqrt(dt)
     walk = np.array([noise.accel_walk_m_s3_rthz] * 3 + [noise.gyro_walk_rad_s2_rthz] * 3) * root
-    if problem.bias_released is not None and problem.bias_released[k]:
-        walk = np.hypot(walk, JUMP_SD)
+    if problem.bias_slack is not None:
+        walk = np.hypot(walk, np.repeat(problem.bias_slack[k], 3))
     diagonal, isotropic = gtsam.noiseModel.Diagonal.Sigmas, gtsam.noiseModel.Isotropic.Sigma
     graph.add(gtsam.BetweenFactorVector(V(k), V(k + 1), np.zeros(3), isotropic(3, GAP_VELOCITY_SD_M_S_RTS * root)))
     graph.add(gtsam.BetweenFactorConstantBias(B(k), B(k + 1), gtsam.imuBias.ConstantBias(), diagonal(walk)))

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from fusion import scale as scale_policy
-from fusion.bias_steps import find_bias_steps, suspect_stretches, with_released
+from fusion.bias_changes import BiasChanges, find_bias_changes, suspect_stretches
 from fusion.body_motion import BodyMotion, without_body_motion
 from fusion.chain_engine import ChainEngine
 from fusion.chain_state import ChainState
@@ -26,14 +26,7 @@ from fusion.motion_noise import bounded, is_right, translation_noise, with_noise
 from fusion.native_engine import NativeEngine
 from fusion.problem import Problem
 from fusion.rest import find_rests, with_rests
-from fusion.result import (
-    NO_REST,
-    BiasStep,
-    LoopConclusion,
-    RestConclusion,
-    ScaleConclusion,
-    ScalePolicy,
-)
+from fusion.result import NO_REST, LoopConclusion, RestConclusion, ScaleConclusion, ScalePolicy
 from fusion.scale import FreePass, Segments
 from fusion.solve import MotionTerm, Solution
 from fusion.stages import Stages
@@ -81,7 +74,7 @@ class GraphEstimator:
         if ChainEngine.suits(problem):
             self.engine = ChainEngine() if checkpoint is None else ResumableEngine(ChainEngine(), checkpoint)
         self.notes: list[str] = []
-        self.bias_steps: tuple[BiasStep, ...] = ()
+        self.bias_changes = BiasChanges()
         self.segments: Segments = scale_policy.make_segments(problem.t_s, config.scale.segment_s)
 
     def estimate(self) -> Estimate:
@@ -193,14 +186,14 @@ class GraphEstimator:
 
     def _trusted_start(self, log_scale: float) -> Begin:
         """A start in whose stretches the IMU agrees with the rest, or is trusted less."""
-        self.problem = with_released(self.problem, self.bias_steps)
+        self.problem = self.bias_changes.let_go(self.problem)
         start = self._start(log_scale, 1.0)
-        suspects = suspect_stretches(start) if isinstance(start.values, ChainState) and not self.bias_steps else []
+        suspects = suspect_stretches(start) if isinstance(start.values, ChainState) and not self.bias_changes else []
         if suspects:
-            with self.stages("bias_steps"):
-                self.bias_steps = find_bias_steps(self.problem, self.config, self.segments, start, suspects)
-        if suspects and self.bias_steps:
-            self.problem = with_released(self.problem, self.bias_steps)
+            with self.stages("bias_changes"):
+                self.bias_changes = find_bias_changes(self.problem, self.config, self.segments, start, suspects)
+        if suspects and self.bias_changes:
+            self.problem = self.bias_changes.let_go(self.problem)
             start = self._start(log_scale, 1.0)
         for without_imu in (False, True):
             bad = contradicted(start.stretches)
@@ -345,4 +338,5 @@ class GraphEstimator:
             joint = None if joint is None else with_assumed_scale(
                 joint, T, assumed, T_body_camera, np.random.default_rng(SEED + 1))
         return Estimate(T, cov, states.v, states.gyro_bias, states.accel_bias, log_scale, log_scale_sd, conclusion,
-                        final.rejected, fixed_chi2, inflation, joint, tuple(self.notes), bias_steps=self.bias_steps)
+                        final.rejected, fixed_chi2, inflation, joint, tuple(self.notes),
+                        bias_steps=self.bias_changes.steps, bias_wanders=self.bias_changes.told_wanders)

@@ -18,7 +18,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from fusion.preintegration import INTEGRATION_DENSITY, JUMP_SD
+from fusion.preintegration import INTEGRATION_DENSITY
 from vio import se3
 from vio.imu import ImuNoise, ImuPieces
 
@@ -68,9 +68,9 @@ class InertialSteps:
                              self.v_ba[cut], self.p_bg[cut], self.p_ba[cut], self.whiten[cut], self.free_fall[cut],
                              self.bias_walk_sd[cut], self.accel_bias, self.gyro_bias)
 
-    def released(self, where: NDArray[np.bool_]) -> InertialSteps:
-        """The same with biases that may jump over some intervals (N,)."""
-        return replace(self, bias_walk_sd=np.hypot(self.bias_walk_sd, where[:, None] * JUMP_SD))
+    def loosened(self, bias_slack: Array) -> InertialSteps:
+        """The same with biases that may change by more than their random walk: (N, 2), see `Problem.bias_slack`."""
+        return replace(self, bias_walk_sd=np.hypot(self.bias_walk_sd, np.repeat(bias_slack, 3, axis=1)))
 
     def rotations(self, gyro_bias_rad_s: Array) -> Array:
         """(N, 3, 3) rotations corrected to another gyro bias (3,)."""

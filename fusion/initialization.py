@@ -12,6 +12,7 @@ import gtsam
 import numpy as np
 from gtsam.symbol_shorthand import B, V, X
 from numpy.typing import NDArray
+from scipy.ndimage import median_filter
 
 from fusion.config import InitialConfig, RefineConfig, SolverConfig
 from fusion.graph import Anchor, add_anchor, add_imu, first_anchor, insert_states
@@ -30,6 +31,8 @@ LEVEL_FRAMES = 60
 CLIP_STEP = 6.0
 """Steps longer than this many medians are shortened before chaining the first guess."""
 CHUNK_ITERATIONS, CHUNK_TOLERANCE = 12, 1e-3
+NEARBY_FRAMES = 121
+"""Frames over which the motions show the gyro's bias well enough to chain its rotations, outliers and all."""
 SEARCH_FRAMES = 400
 SEARCH_GRID = np.linspace(-3.0, 3.0, 13)
 CARRIED_POSE_SD = np.array([0.01, 0.01, 1e-3, 1e-4, 1e-4, 1e-4])
@@ -127,7 +130,7 @@ def chunked_start(problem: Problem, config: RefineConfig, log_scale: float, acce
 def _preintegrate(problem: Problem, bias: Array, accel_inflation: float,
                   span: tuple[int, int]) -> list[gtsam.PreintegratedCombinedMeasurements]:
     return preintegrate(problem.pieces, problem.noise, bias[:3], bias[3:], problem.accel_inflation * accel_inflation,
-                        problem.gyro_inflation, span, problem.bias_released)
+                        problem.gyro_inflation, span, problem.bias_slack)
 
 
 def first_guess(problem: Problem, motions: ScaledMotions, rotations: Array, initial: InitialConfig, log_scale: float,
@@ -143,13 +146,30 @@ def first_guess(problem: Problem, motions: ScaledMotions, rotations: Array, init
         k0: the chunk's first frame.
         anchor: what the chunk before carries on; None = level by gravity.
     """
-    R = gyro_chain(problem, rotations, k0)
+    R = gyro_chain(problem, _followed(problem, motions, rotations, k0), k0)
     if anchor is None:
         R = level_rotation(problem, R, k0) @ R
         anchor = first_anchor(se3.transform(R[0], np.zeros(3)), problem.gyro_bias_rad_s, initial)
     else:
         R = anchor.T_world_body[:3, :3] @ R
     return R, *chain_positions(problem, motions, R, anchor.T_world_body[:3, 3], log_scale, k0), anchor
+
+
+def _followed(problem: Problem, motions: ScaledMotions, rotations: Array, k0: int) -> Array:
+    """The gyro's rotations; where biases may change by more than their random walk, with the bias the motions show."""
+    here = slice(k0, k0 + len(rotations))
+    if problem.bias_slack is None or not problem.bias_slack[here].any():
+        return rotations
+    surest = motions.surest_neighbours(len(rotations) + 1)
+    seen = np.flatnonzero((surest >= 0) & problem.imu_usable[here])
+    if len(seen) == 0:
+        return rotations
+    dt = problem.dt_s[here, None]
+    measured = motions.select(surest[seen]).body_rotation()
+    off = se3.so3_log(np.swapaxes(measured, 1, 2) @ rotations[seen]) / dt[seen]
+    near = median_filter(off, size=(NEARBY_FRAMES, 1), mode="nearest")
+    bias = np.stack([np.interp(np.arange(len(rotations)), seen, along) for along in near.T], axis=1)
+    return np.asarray(rotations @ se3.so3_exp(-bias * dt))
 
 
 def _carried(values: gtsam.Values, node: int) -> Anchor:

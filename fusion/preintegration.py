@@ -16,8 +16,6 @@ Array = NDArray[np.float64]
 INTEGRATION_DENSITY = 1e-5
 """Position noise of the integration scheme itself [m/sqrt(s)]; far below every sensor's."""
 INFLATION_STEPS_PER_OCTAVE = 4
-JUMP_SD = np.repeat([0.5, 0.05], 3)
-"""Change of accelerometer [m/s²] and gyro bias [rad/s] per interval where they are let go: any that occurs."""
 
 
 def make_bias(accel_m_s2: Array, gyro_rad_s: Array) -> gtsam.imuBias.ConstantBias:
@@ -38,11 +36,11 @@ def _params(noise: ImuNoise, accel_inflation: float, gyro_inflation: float) -> g
     return params
 
 
-def _jumping(noise: ImuNoise, pieces: ImuPieces, k: int) -> ImuNoise:
-    """Noise whose biases jump over interval k."""
-    per_root_s = JUMP_SD / np.sqrt(pieces.dt_s[pieces.first[k]:pieces.first[k + 1]].sum())
+def _loosened(noise: ImuNoise, pieces: ImuPieces, k: int, slack: Array) -> ImuNoise:
+    """Noise whose biases may change over interval k by (2,) beyond their random walk."""
+    per_root_s = slack / np.sqrt(pieces.dt_s[pieces.first[k]:pieces.first[k + 1]].sum())
     return replace(noise, accel_walk_m_s3_rthz=float(np.hypot(noise.accel_walk_m_s3_rthz, per_root_s[0])),
-                   gyro_walk_rad_s2_rthz=float(np.hypot(noise.gyro_walk_rad_s2_rthz, per_root_s[3])))
+                   gyro_walk_rad_s2_rthz=float(np.hypot(noise.gyro_walk_rad_s2_rthz, per_root_s[1])))
 
 
 def _rounded(inflation: Array) -> Array:
@@ -55,7 +53,7 @@ def _rounded(inflation: Array) -> Array:
 def preintegrate(pieces: ImuPieces, noise: ImuNoise, accel_bias_m_s2: Array, gyro_bias_rad_s: Array,
                  accel_inflation: Array, gyro_inflation: Array,
                  span: tuple[int, int],
-                 released: NDArray[np.bool_] | None = None) -> list[gtsam.PreintegratedCombinedMeasurements]:
+                 bias_slack: Array | None = None) -> list[gtsam.PreintegratedCombinedMeasurements]:
     """Preintegrate the intervals `span[0]` to `span[1]` (exclusive), linearised at one bias.
 
     Args:
@@ -66,13 +64,13 @@ def preintegrate(pieces: ImuPieces, noise: ImuNoise, accel_bias_m_s2: Array, gyr
         accel_inflation: (M,) factor on the accelerometer density in every interval, at least 1.
         gyro_inflation: (M,) factor on the gyro density in every interval, at least 1.
         span: first interval and one past the last.
-        released: (M,) intervals over which the biases may jump; None = nowhere.
+        bias_slack: (M, 2) as in `Problem`; None = nowhere.
     """
     bias = make_bias(accel_bias_m_s2, gyro_bias_rad_s)
     accel_factor, gyro_factor = _rounded(accel_inflation), _rounded(gyro_inflation)
     out = []
     for k in range(*span):
-        walks = noise if released is None or not released[k] else _jumping(noise, pieces, k)
+        walks = noise if bias_slack is None or not bias_slack[k].any() else _loosened(noise, pieces, k, bias_slack[k])
         params = _params(walks, float(accel_factor[k]), float(gyro_factor[k]))
         measurement = gtsam.PreintegratedCombinedMeasurements(params, bias)
         for n in range(pieces.first[k], pieces.first[k + 1]):

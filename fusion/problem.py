@@ -64,8 +64,9 @@ class Problem:
     """How long errors of the motions' translations last (`meta` of the motions); 0 = no longer than a motion."""
     motion_noise: tuple[float, float] = (1.0, 1.0)
     """Factors on the noise of rotation and translation that the motions claimed; already in `motions`."""
-    bias_released: NDArray[np.bool_] | None = None
-    """(M-1,) intervals over which the biases may jump; None = nowhere."""
+    bias_slack: Array | None = None
+    """(M-1, 2) sd by which accelerometer [m/s²] and gyro bias [rad/s] may change over an interval beyond their random
+    walk; None = nowhere."""
 
     @property
     def dt_s(self) -> Array:

@@ -135,7 +135,7 @@ def conclude(recording: Recording, motions: RelativeMotions, problem: Problem, e
         log_scale=estimate.log_scale, log_scale_sd=estimate.log_scale_sd, motions_only=only, scale=estimate.scale,
         motion_noise=(problem.motion_noise[0], problem.motion_noise[1] * estimate.translation_noise),
         imu=ImuConclusion(estimate.imu_chi2_per_dof, estimate.imu_inflation, problem.gaps,
-                          estimate.bias_steps),
+                          estimate.bias_steps, estimate.bias_wanders),
         motions_used=len(motions) - len(estimate.rejected), rejected=estimate.rejected, bridged=bridged,
         time_offset_s=recording.calibration.time_offset_s, truth=_truth(recording, times),
         timing_s=dict(stages.seconds), peak_rss_bytes=_peak_rss_bytes(), joint=estimate.joint,

@@ -90,6 +90,42 @@ def _length(size: Array, sd: Array) -> str:
 
 
 @dataclass(frozen=True)
+class BiasWander:
+    """A stretch in which the IMU's biases wander more than its noise card says, and may do so."""
+
+    first_frame: int
+    """Node of the trajectory it begins at …"""
+    last_frame: int
+    """… and ends at."""
+    start_s: float
+    """Their times."""
+    end_s: float
+    accel_times: float
+    """How many times as much the accelerometer's bias wanders; 1 = as the noise card says."""
+    gyro_times: float
+
+    def to_dict(self) -> dict[str, Any]:
+        """Plain values for `summary.json`, and in words."""
+        return asdict(self) | {"words": self.in_words()}
+
+    @staticmethod
+    def from_dict(values: Mapping[str, Any]) -> BiasWander:
+        """What `to_dict` wrote."""
+        return BiasWander(int(values["first_frame"]), int(values["last_frame"]), float(values["start_s"]),
+                          float(values["end_s"]), float(values["accel_times"]), float(values["gyro_times"]))
+
+    def in_words(self) -> str:
+        """Which sensors' biases wander, how much and when."""
+        sensors = [(name, times) for name, times in (("accelerometer", self.accel_times), ("gyro", self.gyro_times))
+                   if times > 1]
+        whose = " and ".join(f"the {name}'s" for name, _ in sensors)
+        what = f"{whose} bias wanders" if len(sensors) == 1 else f"{whose} biases wander"
+        times = " and ".join(f"{times:.0f}" for _, times in sensors)
+        return (f"{what} up to {times} times as much as the noise card says between {self.start_s:.1f} and "
+                f"{self.end_s:.1f} s (a sensor that warms up, or another one's card)")
+
+
+@dataclass(frozen=True)
 class ImuConclusion:
     """How well the inertial data agree with the rest."""
 
@@ -101,6 +137,8 @@ class ImuConclusion:
     """Holes over 0.5 s; their frame intervals carry no inertial factor."""
     bias_steps: tuple[BiasStep, ...] = ()
     """Where the biases stepped, and were let go."""
+    bias_wanders: tuple[BiasWander, ...] = ()
+    """Where they wander more than the noise card says."""
 
 
 @dataclass(frozen=True)

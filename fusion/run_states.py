@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from fusion.camera_imu import UNKNOWN, CameraImu, read_camera_imu
 from fusion.frame_blocks import FrameBlock
 from fusion.joint import JointSamples
-from fusion.result import BiasStep, ImuConclusion, OnlineConclusion, Refinement, ScaleConclusion, View
+from fusion.result import BiasStep, BiasWander, ImuConclusion, OnlineConclusion, Refinement, ScaleConclusion, View
 from vio import se3
 from vio.camera import Camera
 from vio.errors import FormatError, VioError
@@ -122,13 +122,14 @@ def _refinement(folder: str, summary: dict[str, Any],
         imu, scale, motions = summary["imu"], summary["scale"], summary["motions"]
         gaps = tuple(Gap(float(gap["start_s"]), float(gap["end_s"])) for gap in imu["gaps"])
         steps = tuple(BiasStep.from_dict(step) for step in imu.get("bias_steps", []))
+        wanders = tuple(BiasWander.from_dict(wander) for wander in imu.get("bias_wanders", []))
         return Refinement(
             name=str(summary["name"]), estimator=summary["estimator"], fallback_reason=summary["fallback_reason"],
             trajectory=trajectory, velocity_m_s=states["velocity"], gyro_bias_rad_s=states["gyro_bias"],
             accel_bias_m_s2=states["accel_bias"], log_scale=states["log_scale"], log_scale_sd=states["log_scale_sd"],
             motions_only=motions_only,
             scale=ScaleConclusion(scale["policy"], float(scale["log_mean"]), float(scale["log_sd"]), scale["reason"]),
-            imu=ImuConclusion(imu["chi2_per_dof"], float(imu["inflation"]), gaps, steps),
+            imu=ImuConclusion(imu["chi2_per_dof"], float(imu["inflation"]), gaps, steps, wanders),
             motions_used=int(motions["used"]),
             rejected=np.asarray(rejected, np.int64), bridged=int(motions.get("bridged", 0)),
             time_offset_s=float(summary["time_offset_s"]), truth=truth,

@@ -33,7 +33,8 @@ def summarize(refinement: Refinement) -> dict[str, Any]:
                 "gyro_bias_rad_s": r.gyro_bias_rad_s.mean(axis=0).tolist(),
                 "accel_bias_m_s2": r.accel_bias_m_s2.mean(axis=0).tolist(),
                 "gaps": [{"start_s": g.start_s, "end_s": g.end_s} for g in r.imu.gaps],
-                "bias_steps": [step.to_dict() for step in r.imu.bias_steps]},
+                "bias_steps": [step.to_dict() for step in r.imu.bias_steps],
+                "bias_wanders": [wander.to_dict() for wander in r.imu.bias_wanders]},
         "camera_imu": r.camera_imu.to_dict(),
         "motions": {"used": r.motions_used, "rejected": len(r.rejected), "bridged": r.bridged,
                     "rotation_noise": r.motion_noise[0], "translation_noise": r.motion_noise[1]},
@@ -80,6 +81,7 @@ def sentences(summary: dict[str, Any]) -> str:
         f"motions: {summary['motions']['used']} used, {summary['motions']['rejected']} rejected",
     ]
     lines += [f"imu: {step['words']}; it was let go there" for step in summary["imu"]["bias_steps"]]
+    lines += [f"imu: {wander['words']}; it may do so there" for wander in summary["imu"]["bias_wanders"]]
     if summary["rest"]["stretches"]:
         lines.append(f"rest: {rest_in_words(summary['rest'], summary['duration_s'])}")
     if summary["loops"]["proposed"]:

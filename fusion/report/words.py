@@ -175,6 +175,7 @@ def _imu(refinement: Refinement, gyro_bias_rad_s: Array, accel_bias_m_s2: Array)
     if imu.gaps:
         parts.append(f"{_count(len(imu.gaps), 'hole')} of more than 0.5 s, where only the motions hold the frames.")
     parts += [_begun(f"{step.in_words()}: it was let go there.") for step in imu.bias_steps]
+    parts += [_begun(f"{wander.in_words()}: it may do so there.") for wander in imu.bias_wanders]
     if refinement.time_offset_s:
         parts.append(f"Camera-IMU time offset applied: {1e3 * refinement.time_offset_s:.3g} ms.")
     return " ".join(parts)

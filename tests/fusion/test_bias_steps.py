@@ -95,7 +95,7 @@ def test_what_is_no_step_is_not_called_one(made):
     looked_at = importlib.import_module("fusion.graph_estimator")
     for recording in (examination.shaken_unseen(0.02, 1.7), warm):
         with pytest.MonkeyPatch.context() as patch:
-            find, seen = looked_at.find_bias_steps, []
-            patch.setattr(looked_at, "find_bias_steps", lambda *a, find=find, seen=seen: seen.append(1) or find(*a))
+            find, seen = looked_at.find_bias_changes, []
+            patch.setattr(looked_at, "find_bias_changes", lambda *a, find=find, seen=seen: seen.append(1) or find(*a))
             assert refine(recording, examination.motions).imu.bias_steps == ()
             assert seen
