@@ -166,8 +166,7 @@ correlated: {recordings} recordings are few.
 {judgement}
 
 The refined scale is {scale:.0f} % off in the median (worst {scale_worst:.0f} %) where it claims a standard
-deviation of {claimed:.0f} %, and arc length is proportional to scale. On the same recordings the network's own prior,
-which claims much more, holds."""
+deviation of {claimed:.0f} %, and arc length is proportional to scale."""
 AIM = (90.0, 99.0)
 
 
