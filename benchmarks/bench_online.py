@@ -33,8 +33,9 @@ def main() -> None:
                          f"{np.median(smoothed):.1f}", f"{np.median(graph):.1f}", f"{consistency.mean():.2f}"])
     body = (f"{FRAMES} frames of the small bowel at 3 Hz, seeds {SEEDS[0]}–{SEEDS[-1]}; the true scale is constant\n"
             "and 0.1 (1 sd) off its prior, which all hold. Latency is wall time from a frame's arrival to its pose\n"
-            "with covariance, cutting of samples and preintegration included, measured while other programs shared\n"
-            "the cores; a frame comes every 333 ms. ATE is after Sim3 alignment: scale is not estimated here.\n\n"
+            "with covariance, cutting of samples and preintegration included; what leaves the lag with the next\n"
+            "frame is read before it comes. A frame comes every 333 ms. ATE is after Sim3 alignment: scale is not\n"
+            "estimated here.\n\n"
             + table(["vibration", "lag s", "latency ms, median", "99 %, worst run", "worst", "motions alone mm",
                      "filtered mm", "smoothed mm", "graph, scale held, mm", "pose NEES/dof, filtered"], rows))
     record("online", "Online: latency and accuracy", body)

@@ -26,6 +26,7 @@ for k, t in enumerate(recording.frame_t_s):
     fed = arrived
     seen = [] if k == 0 else [fusion.OnlineMotion(k - 1, motions.T_i_j[k - 1], motions.cov[k - 1])]
     answer = estimator.add_frame(t, seen)
+    estimator.between_frames()  # there is a third of a second until the next one
     if answer is not None and k % 60 == 0:
         sd_mm = 1e3 * np.sqrt(np.diag(answer.newest.cov)[3:].max())
         position_mm = np.round(1e3 * answer.newest.T_world_body[:3, 3], 1)

@@ -10,6 +10,7 @@ from __future__ import annotations
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import takewhile
 from typing import SupportsFloat, SupportsIndex, SupportsInt, TypeAlias
 
 import gtsam
@@ -33,6 +34,8 @@ RELINEARIZE_THRESHOLD = 3e-3
 """Change of a variable (rad, m, m/s) above which its factors are linearised anew."""
 WILDFIRE_THRESHOLD = 1e-5
 """Change [rad, m, m/s] below which a correction is not carried further back; gtsam's own, 1e-3, is a millimetre."""
+FORESEEN = 1.2
+"""Frame intervals that are looked ahead: frames do not come like clockwork."""
 NS_PER_S = 1e9
 
 
@@ -78,7 +81,8 @@ class OnlineAnswer:
 class OnlineEstimator:
     """Estimates the newest pose from inertial samples and motions as they arrive.
 
-    Feed samples with `add_imu` and then each frame with `add_frame`. Times are seconds on the frames' clock.
+    Feed samples with `add_imu` and then each frame with `add_frame`; call `between_frames` once its answer is used.
+    Times are seconds on the frames' clock.
 
     Args:
         noise: continuous densities and walks of the IMU.
@@ -102,6 +106,7 @@ class OnlineEstimator:
         self._times: list[float] = []
         self._newest: OnlineState | None = None
         self._oldest = 0
+        self._read: dict[int, OnlineState] = {}
         self._smoother = self._make_smoother()
 
     def add_imu(self, t_s: Array, gyro_rad_s: Array, accel_m_s2: Array) -> None:
@@ -138,6 +143,16 @@ class OnlineEstimator:
         settled = self._settle()
         self._extend(motions)
         return OnlineAnswer(self._newest_state(), settled, time.perf_counter() - begun)
+
+    def between_frames(self) -> None:
+        """Read what will leave the lag with the next frame, should it come as soon as the last one did.
+
+        Nothing changes it until then. Without this call the next answer is the same and comes later.
+        """
+        if len(self._times) > 1:
+            leaves = self._times[-1] + FORESEEN * (self._times[-1] - self._times[-2]) - self.lag_s
+            open_frames = range(self._oldest, len(self._times) - 1)
+            self._read = {k: self._state(k) for k in takewhile(lambda k: self._times[k] < leaves, open_frames)}
 
     def open_states(self) -> list[OnlineState]:
         """All frames within the lag, oldest first, as known now."""
@@ -262,7 +277,9 @@ class OnlineEstimator:
         first = self._oldest
         while self._oldest < len(self._times) - 2 and self._times[self._oldest] < self._times[-1] - self.lag_s:
             self._oldest += 1
-        return tuple(self._state(k) for k in range(first, self._oldest))
+        settled = tuple(self._read.get(k) or self._state(k) for k in range(first, self._oldest))
+        self._read = {}
+        return settled
 
     def _state(self, k: int) -> OnlineState:
         smoother = self._smoother

@@ -70,6 +70,7 @@ def _replay(recording: Recording, motions: RelativeMotions, problem: Problem, es
         if answer is not None:
             answers.append(answer)
             settled += answer.settled
+            estimator.between_frames()
         if progress is not None:
             progress(k + 1, len(problem))
     return answers, settled + estimator.open_states()

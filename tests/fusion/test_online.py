@@ -87,6 +87,27 @@ def estimator_of(examination, **options):
     return OnlineEstimator(calibration.imu_noise, calibration.T_body_camera, -0.2, **options)
 
 
+def test_what_is_read_between_frames_is_what_would_have_been_read(examination):
+    recording, motions, frames = examination.recording, examination.motions, 60
+    t, imu_t, imu = recording.frame_t_s, recording.imu_t_s, recording.imu
+    upto, settled = int(np.searchsorted(imu_t, t[frames])), []
+    for early in (False, True):
+        estimator, read = estimator_of(examination, lag_s=5.0), []
+        estimator.add_imu(imu_t[:upto], imu.gyro_rad_s[:upto], imu.accel_m_s2[:upto])
+        for k in range(frames):
+            seen = [OnlineMotion(k - 1, motions.T_i_j[k - 1], motions.cov[k - 1])] if k else []
+            answer = estimator.add_frame(t[k], seen)
+            read += answer.settled if answer else ()
+            if early:
+                estimator.between_frames()
+                assert k < 20 or len(estimator._read) in (1, 2)
+        settled.append(read)
+    assert [state.frame for state in settled[0]] == [state.frame for state in settled[1]] == list(range(frames - 16))
+    for one, other in zip(*settled, strict=True):
+        np.testing.assert_array_equal(one.T_world_body, other.T_world_body)
+        np.testing.assert_array_equal(one.cov, other.cov)
+
+
 def test_broken_streams_are_refused_in_one_line(examination):
     recording, motions = examination.recording, examination.motions
     t, imu_t, imu = recording.frame_t_s, recording.imu_t_s, recording.imu
