@@ -35,7 +35,7 @@ def test_to_and_fro_rest_and_tremble_add_nothing(seed: int) -> None:
     track = helix(arc) + 2e-4 * rng.standard_normal((len(arc), 3))
     found = trace_centreline(track).frame_arc_m
     assert np.abs(found - arc).max() < 2e-3 + 0.01 * np.ptp(arc)
-    assert arc_length(track)[-1] > 1.2 * np.ptp(arc)
+    assert arc_length(track)[-1] > 1.1 * np.ptp(arc)  # the least of 1500 seeds: 1.145
 
 
 @settings(max_examples=10)
