@@ -200,7 +200,7 @@ def measure_camera_imu(problem: Problem, pairs: Pairs) -> CameraImu:
 
 def _variances(inverse: Array, pulls: Array, spread2: float) -> Array:
     """(7,) of a fit whose pairs pull (K, 7) at it: what independent errors of one size would leave, or, where larger,
-    what the pulls of consecutive pairs together show (Newey and West, Econometrica 55, 1987)."""
+    what the pulls of consecutive pairs together show (Liang and Zeger, Biometrika 73, 1986)."""
     block = int(np.clip(len(pulls) // FEWEST_BLOCKS, 1, BLOCK_PAIRS))
     together = np.add.reduceat(pulls, np.arange(0, len(pulls), block), axis=0)
     shown = np.einsum("ij,bj->bi", inverse, together)
